@@ -1,0 +1,44 @@
+# make demo    set up, then simulate events, train on them, evaluate and render: outputs/demo/
+# make test    set up, then run every check and every test
+# make lint    the checks alone;   make format   repair what can be repaired;   make clean   undo the set-up
+# PYTHON=...   the interpreter to set up with (3.10 to 3.12)
+
+USABLE = import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
+PYTHON = $(shell for python in python3.12 python3.11 python3.10 python3; do \
+	"$$python" -c '$(USABLE)' 2>/dev/null && echo "$$python" && break; done)
+# The name of the stamp changes with what it depends on, so that an unchanged set-up costs nothing, a fresh checkout included.
+STAMP := .venv/set-up-$(shell cat pyproject.toml constraints.txt | cksum | cut -d' ' -f1)
+
+.PHONY: demo test lint format clean
+
+demo: $(STAMP)
+	.venv/bin/enerf demo --output-dir outputs/demo
+
+test: lint
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/pytest --slow -n 2
+
+lint: $(STAMP)
+	.venv/bin/ruff check
+	.venv/bin/ruff format --check
+	rm -rf build/typecheck && mkdir -p build/typecheck/enerf_ns
+	ln -s "$(CURDIR)"/enerf_ns/* "$(CURDIR)"/dataparsers build/typecheck/enerf_ns
+	ln -s "$(CURDIR)"/tests "$(CURDIR)"/benchmarks "$(CURDIR)"/pyproject.toml build/typecheck
+	cd build/typecheck && PYRIGHT_PYTHON_IGNORE_WARNINGS=1 ../../.venv/bin/pyright --pythonpath ../../.venv/bin/python
+
+format: $(STAMP)
+	.venv/bin/ruff check --fix
+	.venv/bin/ruff format
+
+clean:
+	rm -rf .venv build *.egg-info
+
+# Nerfstudio brings opencv-python-headless, which owns the same folder cv2/ as opencv-contrib-python-headless: the latter
+# comes last.
+$(STAMP):
+	@.venv/bin/python -m pip --version >/dev/null 2>&1 || test -n "$(PYTHON)" || { echo "No Python 3.10, 3.11 or 3.12 \
+	with venv and ensurepip was found: install one, or name one with PYTHON=/path/to/python3." >&2; exit 1; }
+	.venv/bin/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear .venv
+	.venv/bin/python -m pip install -c constraints.txt -e '.[dev]'
+	.venv/bin/python -m pip install -c constraints.txt --no-deps --force-reinstall opencv-contrib-python-headless
+	rm -f .venv/set-up-*
+	touch $@

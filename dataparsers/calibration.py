@@ -1,0 +1,98 @@
+"""Camera models: where each pixel looks, and images without lens distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Shaped
+
+ROUND_TRIP_TOLERANCE = 1e-6
+"""Pixels between a pixel and the projection of its direction."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres."""
+
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    fx: float
+    """Focal length in pixels."""
+    fy: float
+    cx: float
+    """Principal point in pixels."""
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """radtan: k1, k2, p1, p2 and, if given, k3 (Brown-Conrady); fisheye: k1 to k4 (Kannala-Brandt)."""
+    model: Literal["pinhole", "radtan", "fisheye"] = "pinhole"
+
+    @property
+    def matrix(self) -> Float64[np.ndarray, "3 3"]:
+        """Projects camera coordinates with z = 1 to pixels, for a camera without distortion."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def pixel_directions(self) -> Float64[np.ndarray, "height width 3"]:
+        """Where the centre of each pixel looks: camera axes (x right, y down, z forward), z = 1, not normalised.
+
+        Raises:
+            ValueError: The distortion has no inverse at some pixel, so that the calibration cannot be right.
+        """
+        return self._pixel_directions.copy()
+
+    @cached_property
+    def _pixel_directions(self) -> np.ndarray:
+        rows, columns = np.mgrid[: self.height, : self.width].astype(float)
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+        coefficients = np.array(self.distortion)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
+        if self.model == "fisheye":
+            points = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients, criteria=criteria)
+        elif self.model == "radtan":
+            points = cv2.undistortPointsIter(pixels, self.matrix, coefficients, np.eye(3), np.eye(3), criteria)
+        else:
+            points = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        directions = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+        if self.model == "fisheye":
+            projected = cv2.fisheye.distortPoints(points, self.matrix, coefficients)
+        else:
+            projected = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), self.matrix, coefficients)[0]
+        wrong = ~(np.linalg.norm(projected - pixels, axis=-1) <= ROUND_TRIP_TOLERANCE)
+        if wrong.any():
+            raise ValueError(
+                f"the {self.model} distortion {self.distortion} has no inverse at {wrong.sum():,} of the "
+                f"{self.width} x {self.height} pixels"
+            )
+        return directions.reshape(self.height, self.width, 3)
+
+    def undistorted(self) -> Camera:
+        """The pinhole camera of the same size whose image holds only pixels that this camera sees; itself if pinhole.
+
+        OpenCV's `getOptimalNewCameraMatrix` with alpha = 0; for fisheye, `estimateNewCameraMatrixForUndistortRectify`
+        with balance = 0.
+        """
+        if self.model == "pinhole":
+            return self
+        size, coefficients = (self.width, self.height), np.array(self.distortion)
+        if self.model == "fisheye":
+            matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                self.matrix, coefficients, size, np.eye(3), balance=0.0
+            )
+        else:
+            matrix, _ = cv2.getOptimalNewCameraMatrix(self.matrix, coefficients, size, 0.0)
+        fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Camera(self.width, self.height, fx, fy, cx, cy)
+
+    def undistort(self, image: Shaped[np.ndarray, "height width channels"]) -> Shaped[np.ndarray, "height width channels"]:
+        """The image as the camera `undistorted()` would have taken it, bilinearly interpolated, of the same type."""
+        if self.model == "pinhole":
+            return image
+        matrix, coefficients = self.undistorted().matrix, np.array(self.distortion)
+        if self.model == "fisheye":
+            return cv2.fisheye.undistortImage(image, self.matrix, coefficients, Knew=matrix).reshape(image.shape)
+        return cv2.undistort(image, self.matrix, coefficients, newCameraMatrix=matrix).reshape(image.shape)

@@ -1,0 +1,137 @@
+"""Multiresolution hash grid (Müller et al., Instant Neural Graphics Primitives, SIGGRAPH 2022, section 3).
+
+One layout of parameters, two backends that compute the same function: `hash_grid` below in plain PyTorch, which runs on
+any device and is the test oracle, and `enerf_ns.encodings.hash_grid_numba`, compiled on first use, for the CPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import itertools
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+Backend = Literal["auto", "torch", "numba"]
+
+
+def hash_grid(
+    x: Float[Tensor, "*batch 3"], table: Float[Tensor, "entries features"], scalings: Float[Tensor, " levels"]
+) -> Float[Tensor, "*batch encoding"]:
+    """Trilinear interpolation of hashed features at every level (equations 2 to 4 of the paper), in plain PyTorch.
+
+    Every level is hashed, also those whose lattice would fit the table, as in Nerfstudio's PyTorch HashEncoding.
+    Differentiable in `x` and `table`. On a plane of a level's lattice the encoding has a kink; the derivative across
+    the plane that is returned for that level is zero, as in Nerfstudio.
+
+    Args:
+        x: positions, meant for [0, 1]; the lattice goes on outside of it.
+        table: levels * T rows, level after level; T is a power of two.
+        scalings: lattice cells a unit length, for each level; whole numbers.
+
+    Returns:
+        levels * features numbers a position, level after level.
+    """
+    num_levels, features_per_level = len(scalings), table.shape[1]
+    table_size = len(table) // num_levels
+    scaled = x[..., None, :] * scalings[:, None]  # [..., levels, 3]
+    floor, ceil = torch.floor(scaled), torch.ceil(scaled)
+    weights = torch.stack([1 - (scaled - floor), scaled - floor])
+    primes = torch.tensor([1, 2654435761, 805459861], device=x.device)
+    hashes = torch.stack([floor, ceil]).long() * primes
+    offsets = torch.arange(num_levels, device=x.device) * table_size
+
+    encoding = torch.zeros((), device=x.device)
+    for i, j, k in itertools.product((0, 1), repeat=3):
+        rows = ((hashes[i, ..., 0] ^ hashes[j, ..., 1] ^ hashes[k, ..., 2]) & (table_size - 1)) + offsets
+        # of PyTorch's ways to look up rows, the one with the fastest backward pass on the CPU
+        features = table.gather(0, rows.reshape(-1, 1).expand(-1, features_per_level))
+        weight = weights[i, ..., 0] * weights[j, ..., 1] * weights[k, ..., 2]
+        encoding = encoding + weight[..., None] * features.view(*rows.shape, features_per_level)
+    return encoding.flatten(start_dim=-2)
+
+
+@functools.cache
+def _numba_kernels() -> ModuleType | None:
+    try:
+        return importlib.import_module("enerf_ns.encodings.hash_grid_numba")
+    except ImportError:
+        return None
+
+
+class HashGrid(nn.Module):
+    """Encoding of positions by a multiresolution hash grid; the same function, and the same table row by row, as
+    Nerfstudio 1.1.5's `HashEncoding(implementation="torch")`.
+
+    The backend is chosen at each call, and the checkpoint holds nothing but `table`: what one backend has trained, the
+    other one loads.
+
+    Args:
+        num_levels: number of levels, at least 1.
+        min_res: lattice cells along each side of the unit cube at the coarsest level.
+        max_res: the same at the finest level; the levels between are in geometric progression, rounded down.
+        log2_table_size: each level has 2**log2_table_size rows.
+        features_per_level: numbers in one row.
+        init_scale: the table starts uniform in [-init_scale, init_scale).
+        backend: "torch", "numba" (float32 on the CPU, two features per level), or "auto", which is "numba" where that
+            can run and "torch" elsewhere.
+
+    Raises:
+        ValueError: for an unknown backend, or "numba" with other than two features per level.
+    """
+
+    scalings: Tensor
+
+    def __init__(
+        self,
+        num_levels: int = 16,
+        min_res: int = 16,
+        max_res: int = 1024,
+        log2_table_size: int = 19,
+        features_per_level: int = 2,
+        init_scale: float = 1e-4,
+        backend: Backend = "auto",
+    ) -> None:
+        super().__init__()
+        if backend not in ("auto", "torch", "numba"):
+            raise ValueError(f'backend is "{backend}", but must be "auto", "torch" or "numba"')
+        if backend == "numba" and features_per_level != 2:
+            raise ValueError(f'backend "numba" needs 2 features per level, not {features_per_level}; use "auto"')
+        self.backend: Backend = backend
+        self.out_dim = num_levels * features_per_level
+        growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
+        scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as Nerfstudio does
+        self.register_buffer("scalings", scalings, persistent=False)
+        table = torch.rand(num_levels * 2**log2_table_size, features_per_level) * 2 - 1
+        self.table = nn.Parameter(table * init_scale)
+
+    def forward(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch out_dim"]:
+        """Encodes positions in [0, 1]; slightly outside, the lattice goes on.
+
+        Raises:
+            ValueError: if the last axis of `x` is not 3, or if backend "numba" is asked for and `x` or the table is not
+                float32 on the CPU.
+        """
+        if x.shape[-1] != 3:
+            raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")
+        fits_numba = (
+            x.device.type == self.table.device.type == "cpu"
+            and x.dtype == self.table.dtype == torch.float32
+            and self.table.shape[1] == 2
+        )
+        if self.backend == "numba":
+            if not fits_numba:
+                raise ValueError(
+                    f'backend "numba" needs positions and table in float32 on the CPU, not {x.dtype} on {x.device} and '
+                    f'{self.table.dtype} on {self.table.device}; use "auto"'
+                )
+            if _numba_kernels() is None:
+                raise ValueError('backend "numba" needs the package numba, which cannot be imported; use "auto"')
+        kernels = _numba_kernels() if fits_numba and self.backend != "torch" else None
+        backend = hash_grid if kernels is None else kernels.hash_grid
+        return backend(x, self.table, self.scalings)

@@ -1,0 +1,112 @@
+"""The methods that Nerfstudio knows of after this package is installed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import numpy as np
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+from enerf_ns.enerf_model import EnerfModelConfig
+from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.ffmpeg import make_ffmpeg_available
+
+
+@dataclass
+class FusedAdamOptimizerConfig(AdamOptimizerConfig):
+    """Adam with the settings of instant neural graphics primitives, all parameters in one kernel."""
+
+    betas: Tuple[float, float] = (0.9, 0.99)  # noqa: UP006
+    """Decay of the running means."""
+    fused: bool = True
+    """One kernel for the whole step; on a hash grid several times faster than the loop."""
+
+
+def allow_numpy_scalars_in_checkpoints() -> None:
+    """Let torch 2.6 and later load the learning rates that Nerfstudio's scheduler stores as NumPy scalars."""
+    scalar: Any = np.float64(0).__reduce__()[0]
+    torch.serialization.add_safe_globals(
+        [
+            scalar,
+            (scalar, "numpy.core.multiarray.scalar"),
+            (scalar, "numpy._core.multiarray.scalar"),
+            np.dtype,
+            type(np.dtype(np.float64)),
+            type(np.dtype(np.float32)),
+        ]
+    )
+
+
+def method_config(
+    name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
+) -> EnerfTrainerConfig:
+    """A trainer whose learning rate falls to a hundredth over the run, on the device that the machine has."""
+    return EnerfTrainerConfig(
+        method_name=name,
+        max_num_iterations=iterations,
+        steps_per_save=1000,
+        steps_per_eval_batch=iterations + 1,
+        steps_per_eval_image=max(iterations // 10, 1),
+        steps_per_eval_all_images=iterations + 1,
+        mixed_precision=False,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        pipeline=pipeline,
+        optimizers={
+            "fields": {
+                "optimizer": FusedAdamOptimizerConfig(lr=learning_rate, eps=1e-15),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.01 * learning_rate, max_steps=iterations),
+            }
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 13, quit_on_train_completion=True),
+        vis="viewer",
+    )
+
+
+make_ffmpeg_available()
+allow_numpy_scalars_in_checkpoints()
+
+enerf = MethodSpecification(
+    config=method_config(
+        "enerf",
+        iterations=6000,
+        learning_rate=1e-2,
+        pipeline=EnerfPipelineConfig(
+            datamanager=EnerfDataManagerConfig(), model=EnerfModelConfig(eval_num_rays_per_chunk=1 << 12)
+        ),
+    ),
+    description="E-NeRF: radiance field from an event camera, tuned for error against time.",
+)
+
+enerf_paper = MethodSpecification(
+    config=method_config(
+        "enerf-paper",
+        iterations=100_000,
+        learning_rate=5e-3,
+        pipeline=EnerfPipelineConfig(
+            datamanager=EnerfDataManagerConfig(
+                event_pairs=30096, pair_mode="successor", uniform_over="pixels", train_num_rays_per_batch=30096
+            ),
+            model=EnerfModelConfig(
+                num_levels=16,
+                base_res=16,
+                max_res=4096,
+                log2_table_size=19,
+                hidden_dim=64,
+                hidden_dim_color=64,
+                view_direction=True,
+                sampling="uniform",
+                num_samples=512,
+                distortion_loss_weight=0.0,
+                eval_num_rays_per_chunk=1 << 12,
+            ),
+        ),
+    ),
+    description="E-NeRF with the sampling and field of the paper (Klenk et al., RA-L 2023).",
+)

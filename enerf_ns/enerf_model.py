@@ -1,0 +1,274 @@
+"""E-NeRF as a Nerfstudio model: from rays to brightness, from brightness to losses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.ray_samplers import (
+    LinearDisparitySampler,
+    PDFSampler,
+    ProposalNetworkSampler,
+    UniformSampler,
+)
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+from enerf_ns.enerf_field import EnerfField, HashDensity
+from enerf_ns.evaluation.metrics import align_brightness, image_metrics
+from enerf_ns.event_camera import linlog, luma, measured_change
+from enerf_ns.losses import event_loss, frame_loss, no_event_loss, normalised_event_loss
+from enerf_ns.ray_samplers import SharedJitter
+
+
+@dataclass
+class EnerfModelConfig(ModelConfig):
+    """E-NeRF. What is None is chosen from the recording when training starts, and stored in config.yml."""
+
+    _target: Type = field(default_factory=lambda: EnerfModel)  # noqa: UP006
+    enable_collider: bool = True
+    """Intersect rays with the scene box."""
+    num_levels: int = 10
+    """Levels of the hash grid."""
+    base_res: int = 16
+    """Cells along the box at the coarsest level."""
+    max_res: Optional[int] = None  # noqa: UP045
+    """Cells along the box at the finest level. None: as fine as the sensor's pixels on the scene."""
+    log2_table_size: int = 17
+    """Base-2 logarithm of the entries of each level."""
+    hidden_dim: int = 32
+    """Width of the density network."""
+    hidden_dim_color: int = 32
+    """Width of the colour network."""
+    num_features: int = 15
+    """What the density network tells the colour network."""
+    view_direction: bool = False
+    """Let colour depend on the viewing direction: for shiny scenes that are seen from many sides."""
+    num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
+    """Colour channels. None: 3 where the field learns from colour frames, else 1."""
+    sampling: Literal["proposal", "uniform"] = "proposal"
+    """Samples along a ray: where a small network expects surfaces, or everywhere."""
+    num_proposal_samples: int = 48
+    """Samples of the proposal network along a ray."""
+    num_samples: int = 24
+    """Samples of the field along a ray."""
+    contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
+    """C_on and C_off. None: the recording's own, else from the counts of both polarities."""
+    event_loss: Literal["threshold", "normalised"] = "threshold"
+    """Compare changes of brightness in units of the threshold, or only up to scale."""
+    event_loss_weight: float = 1.0
+    """Weight of the event loss."""
+    no_event_loss_weight: float = 1.0
+    """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
+    frame_loss_weight: float = 100.0
+    """Weight of the loss on frames."""
+    distortion_loss_weight: float = 0.01
+    """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
+    interlevel_loss_weight: float = 1.0
+    """Weight of the loss by which the proposal network learns."""
+    near_plane: Optional[float] = None  # noqa: UP045
+    """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
+
+
+class BoxCollider(AABBBoxCollider):
+    """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
+
+    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw.
+    """
+
+    def forward(self, ray_bundle: RayBundle) -> RayBundle:
+        ray_bundle = self.set_nears_and_fars(ray_bundle)
+        assert ray_bundle.nears is not None and ray_bundle.fars is not None
+        ray_bundle.nears = ray_bundle.nears.clamp(min=self.near_plane)
+        ray_bundle.fars = torch.maximum(ray_bundle.fars, ray_bundle.nears + 1e-4)
+        return ray_bundle
+
+
+class EnerfModel(Model):
+    """Hash-grid radiance field whose changes of log brightness explain the events of a camera."""
+
+    config: EnerfModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        config = self.config
+        assert (
+            config.contrast_thresholds and config.max_res and config.num_channels and config.near_plane is not None
+        ), "enerf_ns.scene_choices fills in what the config leaves open before the model is built"
+        aabb = self.scene_box.aabb
+        self.collider = BoxCollider(self.scene_box, config.near_plane)
+        self.field = EnerfField(
+            aabb,
+            num_channels=config.num_channels,
+            view_direction=config.view_direction,
+            hidden_dim_color=config.hidden_dim_color,
+            num_features=config.num_features,
+            num_levels=config.num_levels,
+            min_res=config.base_res,
+            max_res=config.max_res,
+            log2_table_size=config.log2_table_size,
+            hidden_dim=config.hidden_dim,
+        )
+        initial = UniformSampler(single_jitter=True)
+        self.proposal = None
+        if config.sampling == "proposal":
+            self.proposal = HashDensity(
+                aabb, num_levels=5, min_res=16, max_res=max(16, config.max_res // 2), log2_table_size=15, hidden_dim=16
+            )
+            self.sampler = ProposalNetworkSampler(
+                num_proposal_samples_per_ray=(config.num_proposal_samples,),
+                num_nerf_samples_per_ray=config.num_samples,
+                num_proposal_network_iterations=1,
+                initial_sampler=initial,
+                pdf_sampler=PDFSampler(include_original=False, single_jitter=True),
+                update_sched=lambda step: 1 if step > 500 else 0,
+            )
+        else:
+            self.sampler = UniformSampler(num_samples=config.num_samples)
+        self.renderer_rgb = RGBRenderer(background_color="random")
+        self.renderer_accumulation = AccumulationRenderer()
+        self.renderer_depth = DepthRenderer(method="median")
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        return {"fields": list(self.field.parameters()) + list(self.proposal.parameters() if self.proposal else [])}
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        if self.proposal is None:
+            return []
+        return [
+            TrainingCallback(
+                where_to_run=[TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
+                update_every_num_iters=1,
+                func=self.sampler.step_cb,
+            )
+        ]
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Render rays.
+
+        Args:
+            ray_bundle: Any rays; in training usually a `PairedRayBundle`.
+
+        Returns:
+            rgb (rays, 3) in [0, 1], depth (rays, 1) in scene units along the ray, accumulation (rays, 1) and, outside
+            training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training also what the losses need.
+        """
+        if ray_bundle.nears is None:
+            ray_bundle = self.collider(ray_bundle)
+        num_pairs = getattr(ray_bundle, "num_pairs", 0)
+        with SharedJitter(num_pairs):
+            if self.proposal is not None:
+                samples, weights_list, samples_list = self.sampler(ray_bundle, density_fns=[self.proposal.density_fn])
+            else:
+                samples, weights_list, samples_list = self.sampler(ray_bundle), [], []
+            field_outputs = self.field(samples)
+            weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+            accumulation = self.renderer_accumulation(weights=weights)
+            rays = accumulation.shape[0]
+            background = (
+                torch.rand((rays, 1), device=accumulation.device)
+                if self.training
+                else torch.full((rays, 1), 0.0, device=accumulation.device)
+            )
+        color = torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + (1.0 - accumulation) * background
+        outputs = {"rgb": color.expand(-1, 3), "accumulation": accumulation}
+        with torch.no_grad():
+            outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
+        if self.training:
+            outputs |= {
+                "weights_list": [*weights_list, weights],
+                "ray_samples_list": [*samples_list, samples],
+            }
+        else:
+            outputs["normals"] = self.normals(ray_bundle.origins + ray_bundle.directions * outputs["depth"])
+        return outputs
+
+    @torch.no_grad()
+    def normals(self, points: Tensor) -> Tensor:
+        """Surface normals at points (rays, 3), mapped to [0, 1]: the direction in which density falls fastest.
+
+        Differences of log density over the corners of a tetrahedron as wide as two cells of the finest level.
+        """
+        assert self.config.max_res is not None
+        corners = points.new_tensor([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]])
+        size = 2.0 * float((self.scene_box.aabb[1] - self.scene_box.aabb[0]).max()) / self.config.max_res
+        density = self.field.geometry.density_fn(points[:, None] + size * corners)
+        gradient = torch.sum(torch.log(density + 1e-6) * corners, dim=1)
+        return 0.5 - 0.5 * torch.nn.functional.normalize(gradient, dim=-1)
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        config = self.config
+        num_pairs = batch["num_pairs"]
+        losses: dict[str, Tensor] = {}
+        if num_pairs:
+            predicted, measured, num_events = self.brightness_changes(outputs, batch)
+            thresholds = config.contrast_thresholds
+            assert thresholds is not None
+            if config.event_loss == "threshold":
+                loss = event_loss(predicted[:num_events], measured, 0.5 * sum(thresholds))
+            else:
+                loss = normalised_event_loss(predicted[:num_events], measured)
+            losses["event_loss"] = config.event_loss_weight * loss
+            if num_events < num_pairs:
+                losses["no_event_loss"] = config.no_event_loss_weight * no_event_loss(
+                    predicted[num_events:], thresholds
+                )
+        if "image" in batch:
+            losses["frame_loss"] = config.frame_loss_weight * self.frame_error(outputs, batch)
+        if self.training:
+            weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
+            if config.distortion_loss_weight:
+                losses["distortion_loss"] = config.distortion_loss_weight * distortion_loss(weights, samples)
+            if self.proposal is not None:
+                losses["interlevel_loss"] = config.interlevel_loss_weight * interlevel_loss(weights, samples)
+        return losses
+
+    def brightness_changes(self, outputs, batch) -> tuple[Tensor, Tensor, int]:
+        """Rendered changes of log brightness (pairs,), measured ones (event pairs,), and how many pairs have events."""
+        num_pairs = batch["num_pairs"]
+        log_brightness = linlog(luma(outputs["rgb"][: 2 * num_pairs]))
+        assert self.config.contrast_thresholds is not None
+        measured = measured_change(batch["on"], batch["off"], self.config.contrast_thresholds)
+        return log_brightness[num_pairs:] - log_brightness[:num_pairs], measured, len(measured)
+
+    def frame_error(self, outputs, batch) -> Tensor:
+        """Mean squared error of the frame rays; in grey where the field is grey."""
+        rendered, recorded = outputs["rgb"][2 * batch["num_pairs"] :], batch["image"]
+        if self.config.num_channels == 1:
+            rendered, recorded = rendered[..., :1], luma(recorded)[..., None]
+        return frame_loss(rendered, recorded)
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
+        metrics = {}
+        if batch["num_pairs"]:
+            predicted, measured, num_events = self.brightness_changes(outputs, batch)
+            metrics["event_correlation"] = torch.corrcoef(torch.stack([predicted[:num_events], measured]))[0, 1]
+        if "image" in batch:
+            metrics["frame_psnr"] = -10.0 * torch.log10(self.frame_error(outputs, batch))
+        return metrics
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once."""
+        recorded = batch["image"].to(outputs["rgb"].device)[..., :3]
+        aligned = align_brightness([outputs["rgb"]], [recorded])[0][0]
+        images = {"img": torch.cat([recorded, aligned], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
+        return image_metrics(aligned, recorded), images
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
+        """Always strict: parameters that do not fit are an error, never a silently random field."""
+        return super().load_state_dict(state_dict, strict=True, assign=assign)

@@ -1,0 +1,136 @@
+"""Evaluation over the whole set of held-out frames."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import numpy as np
+import torch
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from rich.progress import track
+from torch import Tensor
+
+from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
+from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
+from enerf_ns.evaluation.lpips import lpips
+from enerf_ns.evaluation.metrics import align_brightness, depth_rmse, image_metrics
+
+
+@dataclass
+class EnerfPipelineConfig(VanillaPipelineConfig):
+    """Nerfstudio's pipeline, with one brightness fit over all held-out frames."""
+
+    _target: Type = field(default_factory=lambda: EnerfPipeline)  # noqa: UP006
+    datamanager: EnerfDataManagerConfig = field(default_factory=EnerfDataManagerConfig)
+    model: EnerfModelConfig = field(default_factory=EnerfModelConfig)
+
+
+@dataclass
+class HeldOutView:
+    """One held-out frame and what the field shows there. Tensors of shape (height, width, channels) on the CPU."""
+
+    recorded: Tensor
+    """Frame in [0, 1], three channels."""
+    rendered: Tensor
+    """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
+    depth: Tensor
+    """Rendered depth in metres along the optical axis, one channel."""
+    recorded_depth: Tensor | None
+    """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
+    time: int
+    """Instant in ns."""
+
+
+class EnerfPipeline(VanillaPipeline):
+    """Scores held-out frames together, because events fix brightness only up to one scale and offset."""
+
+    datamanager: EnerfDataManager
+    config: EnerfPipelineConfig
+
+    @property
+    def model(self) -> EnerfModel:
+        return super().model  # type: ignore
+
+    @torch.no_grad()
+    def held_out_views(self) -> tuple[list[HeldOutView], dict[str, float]]:
+        """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
+
+        Returns:
+            The views, and numbers about the whole set: rendering speed, scale and offset of the brightness fit.
+        """
+        self.eval()
+        manager = self.datamanager
+        dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
+        views: list[HeldOutView] = []
+        start = time.perf_counter()
+        for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
+            data = dataset[index]
+            camera = dataset.cameras[index : index + 1].to(self.device)
+            rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+            outputs = self.model.get_outputs_for_camera_ray_bundle(rays)
+            z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
+            views.append(
+                HeldOutView(
+                    recorded=data["image"][..., :3],
+                    rendered=outputs["rgb"].cpu(),
+                    depth=z_depth.cpu(),
+                    recorded_depth=data.get("depth"),
+                    time=int(dataset.frames.times[index]),
+                )
+            )
+        seconds = time.perf_counter() - start
+        summary = {
+            "num_rays_per_sec": sum(view.recorded[..., 0].numel() for view in views) / seconds,
+            "fps": len(views) / seconds,
+        }
+        if manager.config.supervision == "events":
+            aligned, (scale, offset) = align_brightness(
+                [view.rendered for view in views], [view.recorded for view in views]
+            )
+            for view, image in zip(views, aligned):
+                view.rendered = image
+            summary |= {"brightness_scale": scale, "brightness_offset": offset}
+        self.train()
+        return views, summary
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Mean scores over the held-out frames: psnr, ssim, correlation, and lpips and depth_rmse where available.
+
+        Args:
+            step: Ignored; Nerfstudio passes it.
+            output_path: Folder for one picture a frame, recorded beside rendered.
+            get_std: Give the standard deviation over the frames too.
+        """
+        views, summary = self.held_out_views()
+        scores = [view_scores(view) for view in views]
+        if output_path is not None:
+            output_path.mkdir(parents=True, exist_ok=True)
+            for index, view in enumerate(views):
+                picture = torch.cat([view.recorded, view.rendered], dim=1).clamp(0.0, 1.0)
+                Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(
+                    output_path / f"eval_img_{index:04d}.png"
+                )
+        for key in scores[0]:
+            values = [score[key] for score in scores]
+            summary[key] = float(np.mean(values))
+            if get_std:
+                summary[f"{key}_std"] = float(np.std(values))
+        return summary
+
+
+def view_scores(view: HeldOutView) -> dict[str, float]:
+    """Scores of one held-out frame."""
+    scores = image_metrics(view.rendered, view.recorded)
+    perceptual = lpips(view.rendered, view.recorded)
+    if perceptual is not None:
+        scores["lpips"] = perceptual
+    if view.recorded_depth is not None:
+        scores["depth_rmse"] = depth_rmse(view.depth, view.recorded_depth)
+    return scores

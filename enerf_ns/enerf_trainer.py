@@ -1,0 +1,120 @@
+"""Training as a person sees it: what the recording holds at the start, where everything lies at the end."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.table import Table
+
+from enerf_ns.dataparsers.event_dataparser import EventDataParser
+from enerf_ns.dataparsers.recording import EventRecording, RecordingError
+from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.scene_choices import Choice, absolute, fill_in_choices
+
+
+@dataclass
+class EnerfTrainerConfig(TrainerConfig):
+    """Nerfstudio's trainer; reads and checks the recording before anything is written."""
+
+    _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
+    pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
+
+    def prepare(self) -> tuple[EventRecording, list[Choice]]:
+        """Read the recording and fill in what depends on it: paths, experiment name, choices.
+
+        Raises:
+            RecordingError: if the recording cannot be used. Nothing has been written then.
+        """
+        manager = self.pipeline.datamanager
+        if self.data is None:
+            self.data = manager.data or manager.dataparser.data
+        if self.data == Path():
+            raise RecordingError("--data is missing; give the folder of a recording")
+        self.data = manager.data = manager.dataparser.data = absolute(self.data)
+        self.output_dir = absolute(self.output_dir)
+        recording = EventDataParser(manager.dataparser).recording()
+        choices = fill_in_choices(self.pipeline, recording)
+        recording.events  # noqa: B018 - reads and checks them
+        return recording, choices
+
+    def save_config(self) -> None:
+        """Show what the recording holds and what is made of it, then store both with the run."""
+        try:
+            recording, choices = self.prepare()
+        except RecordingError as error:
+            raise SystemExit(f"enerf: {error}") from error
+        CONSOLE.print(recording_table(recording, self))
+        CONSOLE.print(choices_table(choices))
+        super().save_config()
+        (self.get_base_dir() / "choices.json").write_text(json.dumps([asdict(choice) for choice in choices], indent=2))
+
+
+class EnerfTrainer(Trainer):
+    """Nerfstudio's trainer, ending with a list of what was made."""
+
+    config: EnerfTrainerConfig
+
+    def setup(self, test_mode="val") -> None:
+        self.config.prepare()
+        super().setup(test_mode)
+
+    def _after_train(self) -> None:
+        super()._after_train()
+        config = self.base_dir / "config.yml"
+        table = Table(title="Training is done", show_header=False, title_justify="left")
+        for what, where in {
+            "checkpoint": str(self.checkpoint_dir),
+            "scores": f"ns-eval --load-config {config} --output-path {self.base_dir / 'scores.json'}",
+            "video": f"ns-render interpolate --load-config {config} --output-path {self.base_dir / 'video.mp4'}",
+            "look around": f"ns-viewer --load-config {config}",
+        }.items():
+            table.add_row(what, where)
+        CONSOLE.print(table)
+
+
+def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Table:
+    """What the recording holds."""
+    events, camera = recording.events, recording.camera
+    seconds = max(int(events.t[-1] - events.t[0]), 1) * 1e-9
+    on = float((events.p > 0).mean())
+    depth = config.pipeline.datamanager.dataparser.depth_range
+    rows = {
+        "folder": f"{recording.path} ({recording.format})",
+        "events": f"{len(events):,}, {100 * on:.0f} % on",
+        "span": f"{seconds:.2f} s",
+        "rate": f"{len(events) / seconds / 1e6:.2f} million events/s, "
+        f"{len(events) / (camera.width * camera.height):.1f} a pixel",
+        "sensor": f"{camera.width} x {camera.height}, {camera.model}",
+        "poses": f"{len(recording.trajectory.times):,}",
+    }
+    for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
+        if frames is None:
+            rows[name] = "none"
+            continue
+        depth_note = ", with depth" if frames.depth_filenames else ""
+        rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
+    if depth is not None:
+        rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
+    table = Table(title="Recording", show_header=False, title_justify="left")
+    for name, value in rows.items():
+        table.add_row(name, value)
+    for note in recording.notes:
+        table.add_row("note", f"[yellow]{note}[/yellow]")
+    return table
+
+
+def choices_table(choices: list[Choice]) -> Table:
+    """What is kept and what is left out, and why."""
+    table = Table(title="Parts of the method", title_justify="left")
+    for column in ("part", "", "what", "why"):
+        table.add_column(column)
+    for choice in choices:
+        table.add_row(
+            choice.part, "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]", choice.value, choice.why
+        )
+    return table

@@ -1,0 +1,218 @@
+"""Which instants of which pixels a training step compares: pairs of events, and silent pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from enerf_ns.dataparsers.events import EventIndex
+
+
+@dataclass(frozen=True)
+class EventPairs:
+    """A batch of pixels, each with two instants and the events that it fired after the first, up to the second."""
+
+    pixels: Int64[Tensor, " batch"]
+    """y * width + x"""
+    start: Int64[Tensor, " batch"]
+    """First instant, ns."""
+    end: Int64[Tensor, " batch"]
+    """Second instant, ns; later than the first."""
+    on: Int64[Tensor, " batch"]
+    """Number of positive events in (start, end]."""
+    off: Int64[Tensor, " batch"]
+    """Number of negative events in (start, end]."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+class EventPairSampler:
+    """Draws pairs of events of one pixel.
+
+    Events of one pixel with the same time stamp are one instant, so that a pair never has zero length. With i the
+    number of an instant of a pixel, the pairs are
+
+    * successor: (i, i + 1), the default of E-NeRF;
+    * partner: (i, i + d) with every distance d from 1 to `max_distance`;
+    * window: time is cut into windows of `window_ns` from the first event on, and the pair is (i, last instant of this
+      pixel in the same window), the 60 ms ablation of E-NeRF.
+
+    Args:
+        index: The events; batches come out on its device.
+        mode: Which pairs there are.
+        max_distance: For mode partner, at least 1.
+        window_ns: For mode window, at least 1.
+        uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are, and so
+            are all pairs of a pixel.
+
+    Raises:
+        ValueError: There is no pair to draw, or an argument is outside its range.
+    """
+
+    def __init__(
+        self,
+        index: EventIndex,
+        mode: Literal["successor", "partner", "window"],
+        max_distance: int = 30,
+        window_ns: int = 60_000_000,
+        uniform_over: Literal["pairs", "pixels"] = "pairs",
+    ):
+        if max_distance < 1 or window_ns < 1:
+            raise ValueError(
+                f"Pairs need max_distance and window_ns of at least 1, not {max_distance} and {window_ns}."
+            )
+        self.index = index
+        self.window = mode == "window"
+        self.max_distance = 1 if mode == "successor" else max_distance
+
+        instants = _last_of_each(index, index.times)
+        if self.window:
+            first = index.times.min() if len(index.times) else 0
+            lasts = _last_of_each(index, (index.times - first) // window_ns)
+            self._starts = (instants & ~lasts).nonzero()[:, 0].int()
+            self._lasts = lasts.nonzero()[:, 0].int()
+            self._pair_offsets = torch.searchsorted(self._starts, index.offsets.int()).long()
+        else:
+            self._instants = None if instants.all() else instants.nonzero()[:, 0].int()
+            self._offsets = (
+                index.offsets
+                if self._instants is None
+                else torch.searchsorted(self._instants, index.offsets.int()).long()
+            )
+            count = self._offsets.diff()
+            distances = (count - 1).clamp(min=0, max=self.max_distance)
+            pairs = distances * (2 * count - distances - 1) // 2
+            self._pair_offsets = torch.cat([pairs.new_zeros(1), pairs.cumsum(0)])
+        self.num_pairs = int(self._pair_offsets[-1])
+        if self.num_pairs == 0:
+            where = f" within a window of {window_ns * 1e-6:g} ms" if self.window else ""
+            raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
+        self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventPairs:
+        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index."""
+        device = self.index.times.device
+        if self._active is None:
+            pair = torch.randint(self.num_pairs, (batch_size,), generator=generator, device=device)
+            pixels = torch.searchsorted(self._pair_offsets, pair, right=True) - 1
+        else:
+            pixels = self._active[torch.randint(len(self._active), (batch_size,), generator=generator, device=device)]
+            begin = self._pair_offsets[pixels]
+            pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
+        start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
+        on = (self.index.positives[end] - self.index.positives[start]).long()
+        return EventPairs(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
+
+    def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
+        start = self._starts[pair]
+        return start.long(), self._lasts[torch.searchsorted(self._lasts, start)].long()
+
+    def _partner_pair(self, pair: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        # n instants have n - d pairs of distance d. Distances d and m + 1 - d, m the largest, together have 2n - m - 1,
+        # whatever d is: in a table with rows of that length, row r holds distance r + 1 and then distance m - r.
+        first = self._offsets[pixels]
+        count = self._offsets[pixels + 1] - first
+        largest = (count - 1).clamp(max=self.max_distance)
+        length = 2 * count - largest - 1
+        place = pair - self._pair_offsets[pixels]
+        row = place // length
+        column = place - row * length
+        second_half = column >= count - row - 1
+        distance = torch.where(second_half, largest - row, row + 1)
+        start = first + torch.where(second_half, column - (count - row - 1), column)
+        end = start + distance
+        if self._instants is None:
+            return start, end
+        return self._instants[start].long(), self._instants[end].long()
+
+
+class SilentPixelSampler:
+    """Draws pixels and two instants between which they fired nothing, for the no-event loss of E-NeRF.
+
+    A pixel is drawn uniformly over the sensor and an instant uniformly over the recording; the silent interval around
+    it is bounded by the pixel's neighbouring events, or the recording's ends. From an interval at least
+    `min_duration_ns` long, two instants are drawn uniformly, at most `max_duration_ns` apart and never at an event.
+
+    Args:
+        index: The events; batches come out on its device.
+        start_ns, end_ns: First and last instant that may be drawn.
+        min_duration_ns: At least 1.
+        max_duration_ns: At least 2.
+
+    Raises:
+        ValueError: A duration is shorter than that.
+    """
+
+    ROUNDS = 32
+
+    def __init__(self, index: EventIndex, start_ns: int, end_ns: int, min_duration_ns: int, max_duration_ns: int):
+        if min_duration_ns < 1 or max_duration_ns < 2:
+            raise ValueError(
+                "Silent pixels need min_duration_ns of at least 1 and max_duration_ns of at least 2, "
+                f"not {min_duration_ns} and {max_duration_ns}."
+            )
+        self.index = index
+        self.start_ns, self.end_ns = start_ns, end_ns
+        self.min_duration_ns, self.max_duration_ns = min_duration_ns, max_duration_ns
+        self._search_steps = int(index.offsets.diff().max()).bit_length()
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventPairs:
+        """Draws `batch_size` silent pairs (on = off = 0); the generator lives on the device of the index.
+
+        Where silent intervals are so rare that `ROUNDS` rounds find fewer, those found are used again, with other
+        instants; where they find none, the batch is empty.
+        """
+        found = []
+        for _ in range(self.ROUNDS):
+            found.append(self._silent_intervals(max(2 * batch_size, 1024), generator))
+            if sum(len(pixels) for pixels, _, _ in found) >= batch_size:
+                break
+        pixels, begin, end = (torch.cat(parts) for parts in zip(*found, strict=True))
+        if len(pixels):
+            again = torch.arange(batch_size, device=pixels.device) % len(pixels)
+            pixels, begin, end = pixels[again], begin[again], end[again]
+        instants = end - begin + 1
+        one = _randint(instants, generator)
+        other = _randint(instants - 1, generator)
+        other += other >= one
+        none = torch.zeros_like(pixels)
+        return EventPairs(pixels, begin + torch.minimum(one, other), begin + torch.maximum(one, other), none, none)
+
+    def _silent_intervals(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""
+        times, offsets = self.index.times, self.index.offsets
+        pixels = torch.randint(len(offsets) - 1, (draws,), generator=generator, device=times.device)
+        instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=times.device)
+        first, stop = offsets[pixels], offsets[pixels + 1]
+        following = first
+        for step in reversed(range(self._search_steps)):
+            candidate = following + (1 << step)
+            passed = (candidate <= stop) & (times[(candidate - 1).clamp(max=len(times) - 1)] <= instant)
+            following = torch.where(passed, candidate, following)
+        previous_time = times[(following - 1).clamp(min=0)]
+        following_time = times[following.clamp(max=len(times) - 1)]
+        begin = torch.where(following > first, previous_time + 1, self.start_ns).clamp(min=self.start_ns)
+        end = torch.where(following < stop, following_time - 1, self.end_ns).clamp(max=self.end_ns)
+        long_enough = end - begin >= self.min_duration_ns
+        instant = torch.maximum(instant, begin)
+        begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
+        end = torch.minimum(end, instant + self.max_duration_ns // 2)
+        return pixels[long_enough], begin[long_enough], end[long_enough]
+
+
+def _last_of_each(index: EventIndex, values: Tensor) -> Tensor:
+    """Whether each event is the last of its pixel with this value; values never decrease within a pixel."""
+    last = torch.ones(len(values), dtype=torch.bool, device=values.device)
+    last[:-1] = values[1:] != values[:-1]
+    last[index.offsets[1:][index.offsets.diff() > 0] - 1] = True
+    return last
+
+
+def _randint(high: Tensor, generator: torch.Generator) -> Tensor:
+    """Random integers in [0, high), a bound for each; biased by less than high / 2^62."""
+    return torch.randint(2**62, high.shape, generator=generator, device=high.device) % high

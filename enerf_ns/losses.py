@@ -1,0 +1,56 @@
+"""The losses of E-NeRF (Klenk et al., RA-L 2023), as pure functions of tensors."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def event_loss(
+    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
+) -> Float[Tensor, ""]:
+    """Mean squared error of the change of log brightness, in units of the contrast threshold.
+
+    Equation 5 of the paper divided by the squared mean threshold (as in Robust e-NeRF, Low and Lee, ICCV 2023), so that
+    the same learning rate and regularisation serve every threshold.
+
+    Args:
+        predicted: Rendered change of log brightness between the two instants of each pair.
+        measured: The change that the pixel's events add up to.
+        mean_threshold: Mean contrast threshold, positive.
+    """
+    return torch.mean(((predicted - measured) / mean_threshold) ** 2)
+
+
+def normalised_event_loss(
+    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], eps: float = 1e-9
+) -> Float[Tensor, ""]:
+    """Squared distance of the two changes after each is divided by its norm over the batch (unknown threshold).
+
+    Equation 6 of the paper. It lies in [0, 4] and does not change when either argument is scaled by a positive number.
+    """
+    difference = predicted / (predicted.norm() + eps) - measured / (measured.norm() + eps)
+    return torch.sum(difference**2)
+
+
+def no_event_loss(
+    predicted: Float[Tensor, " pairs"], thresholds: tuple[float, float]
+) -> Float[Tensor, ""]:
+    """Mean of how far a silent pixel's rendered change goes beyond the thresholds it did not cross.
+
+    Equation 7 of the paper with a threshold per polarity: relu(change - C_on) + relu(-change - C_off). In units of
+    the mean threshold.
+
+    Args:
+        predicted: Rendered change of log brightness between two instants with no event between them.
+        thresholds: Contrast thresholds (C_on, C_off).
+    """
+    on, off = thresholds
+    excess = torch.relu(predicted - on) + torch.relu(-predicted - off)
+    return torch.mean(excess) / (0.5 * (on + off))
+
+
+def frame_loss(predicted: Float[Tensor, "rays channels"], target: Float[Tensor, "rays channels"]) -> Float[Tensor, ""]:
+    """Mean squared error between rendered and recorded pixels, both in [0, 1]."""
+    return torch.mean((predicted - target) ** 2)

@@ -1,0 +1,27 @@
+"""The `enerf` command."""
+
+from __future__ import annotations
+
+from typing import Annotated, Union  # tyro reads these annotations on Python 3.10
+
+import tyro
+
+from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.scripts.demo import Demo
+from enerf_ns.scripts.report import Report
+from enerf_ns.scripts.simulate import Simulate
+
+Command = Union[  # noqa: UP007
+    Annotated[Demo, tyro.conf.subcommand(name="demo")],
+    Annotated[Report, tyro.conf.subcommand(name="report")],
+    Annotated[Simulate, tyro.conf.subcommand(name="simulate")],
+]
+
+
+def entrypoint() -> None:
+    """Run the command line; a user's mistake ends it with one sentence."""
+    command = tyro.cli(Command, description="Radiance fields from event cameras.")
+    try:
+        command.main()
+    except RecordingError as error:
+        raise SystemExit(f"enerf: {error}") from error

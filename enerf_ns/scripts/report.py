@@ -1,0 +1,117 @@
+"""`enerf report`: scores, picture and video of a trained run."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from enerf_ns.enerf_pipeline import EnerfPipeline, HeldOutView, view_scores
+
+PICTURE_ROWS = 3
+"""Held-out frames shown in the picture."""
+
+
+@dataclass
+class Report:
+    """Score a trained run on its held-out frames; write scores.json, side-by-side.png and video.mp4."""
+
+    load_config: Annotated[Path, tyro.conf.Positional]
+    """config.yml of the run."""
+    output_dir: Path | None = None
+    """Folder for the three files. None: the folder of the run."""
+
+    def main(self) -> None:
+        from nerfstudio.utils.eval_utils import eval_setup
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        if not self.load_config.is_file():
+            raise SystemExit(f"enerf: {self.load_config}: no such file; give the config.yml of a trained run")
+        output_dir = self.output_dir or self.load_config.parent
+        _, pipeline, _, _ = eval_setup(self.load_config)
+        assert isinstance(pipeline, EnerfPipeline)
+        scores = write_scores_and_picture(pipeline, output_dir)
+        render_video(self.load_config, output_dir / "video.mp4")
+        CONSOLE.print(scores)
+        CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir.resolve()}")
+
+
+def write_scores_and_picture(
+    pipeline: EnerfPipeline, output_dir: Path, extra: dict[str, float] | None = None
+) -> dict[str, float | None]:
+    """Render the held-out frames once; write scores.json and side-by-side.png.
+
+    Args:
+        pipeline: A trained run.
+        output_dir: Made if it does not exist.
+        extra: Entries put into scores.json beside the scores.
+
+    Returns:
+        What scores.json holds: psnr (dB), ssim, lpips (None where its weights are missing), correlation, and with
+        known depth depth_rmse and mean_depth (metres); means over the held-out frames.
+    """
+    views, summary = pipeline.held_out_views()
+    per_view = [view_scores(view) for view in views]
+    scores: dict[str, float | None] = {"psnr": None, "ssim": None, "lpips": None}
+    scores |= {key: float(np.mean([score[key] for score in per_view])) for key in per_view[0]}
+    known = [view.recorded_depth[view.recorded_depth > 0] for view in views if view.recorded_depth is not None]
+    if known:
+        scores["mean_depth"] = float(np.mean([float(depth.mean()) for depth in known]))
+    scores |= summary | (extra or {})
+
+    output_dir.mkdir(parents=True, exist_ok=True)
+    save_picture(views, pipeline, output_dir / "side-by-side.png")
+    temporary = output_dir / "scores.json.part"
+    temporary.write_text(json.dumps(scores, indent=2) + "\n")
+    os.replace(temporary, output_dir / "scores.json")
+    return scores
+
+
+def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) -> None:
+    """Frame, render, depth and events of a few held-out frames, side by side."""
+    from matplotlib.figure import Figure
+
+    from enerf_ns.event_dataset import event_picture
+
+    recording = pipeline.datamanager.eval_dataset.recording
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, PICTURE_ROWS).round().astype(int))]
+    has_frames = recording.frames is not None or recording.blurred_frames is not None
+    height, width = chosen[0].recorded.shape[:2]
+    figure = Figure(figsize=(13, 3.15 * len(chosen) * height / width * 4 / 3), layout="constrained", dpi=120)
+    axes = figure.subplots(len(chosen), 4, squeeze=False)
+    near = min(float(view.depth.quantile(0.01)) for view in chosen)
+    far = max(float(view.depth.quantile(0.99)) for view in chosen)
+    titles = ("held-out frame" if has_frames else "events", "render", "depth", "events")
+    for row, view in zip(axes, chosen):
+        row[0].imshow(view.recorded.clamp(0, 1).numpy())
+        row[1].imshow(view.rendered.clamp(0, 1).numpy())
+        depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo_r", vmin=near, vmax=far)
+        row[3].imshow(event_picture(recording, view.time))
+        row[0].set_ylabel(f"{view.time * 1e-9:.2f} s")
+        for axis in row:
+            axis.set_xticks([])
+            axis.set_yticks([])
+    for axis, title in zip(axes[0], titles):
+        axis.set_title(title)
+    figure.colorbar(depth, ax=axes[:, 2], label="metres", shrink=0.8)
+    figure.savefig(path)
+
+
+def render_video(load_config: Path, path: Path, steps_between_frames: int = 6) -> None:
+    """A video through the held-out cameras, brightness beside depth, by `ns-render interpolate`."""
+    from nerfstudio.scripts.render import RenderInterpolated
+
+    RenderInterpolated(
+        load_config=load_config,
+        output_path=path,
+        rendered_output_names=["rgb", "depth"],
+        pose_source="eval",
+        interpolation_steps=steps_between_frames,
+        order_poses=False,
+        frame_rate=24,
+    ).main()

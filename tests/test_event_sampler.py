@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare
+
+from enerf_ns.dataparsers.events import EventIndex
+from enerf_ns.dataparsers.recording import Events
+from enerf_ns.event_sampler import EventPairs, EventPairSampler, SilentPixelSampler
+
+WIDTH, HEIGHT = 5, 4
+MODES = ["successor", "partner", "window"]
+WINDOW = 100
+START, END = 50, 1000
+
+
+def make_events(rows: list[tuple[int, int, int]]) -> Events:
+    """Events from (pixel, time, polarity), in any order."""
+    pixel, t, p = np.array(sorted(rows, key=lambda row: row[1])).T
+    return Events(x=(pixel % WIDTH).astype(np.uint16), y=(pixel // WIDTH).astype(np.uint16), t=t, p=p.astype(np.int8))
+
+
+def recording(equal_stamps: bool) -> dict[int, list[tuple[int, int]]]:
+    """(time, polarity) of each pixel: 0 to 12 events, pixels 0, 7 and 19 silent, 5 with one event."""
+    rng = np.random.default_rng(5)
+    pixels = defaultdict(list)
+    for pixel in range(WIDTH * HEIGHT):
+        count = 0 if pixel in (0, 7, 19) else 1 if pixel == 5 else int(rng.integers(2, 13))
+        times = np.sort(rng.choice(np.arange(START, END), count, replace=False))
+        if equal_stamps:
+            times = times // 60 * 60 + START
+        pixels[pixel] = [(int(t), int(rng.choice([-1, 1]))) for t in times]
+    return pixels
+
+
+def index_of(pixels: dict[int, list[tuple[int, int]]], device: str = "cpu") -> EventIndex:
+    events = make_events([(pixel, t, p) for pixel, events in pixels.items() for t, p in events])
+    return EventIndex.from_events(events, WIDTH, HEIGHT).to(device)
+
+
+def all_pairs(pixels: dict, mode: str, max_distance: int) -> list[tuple[int, int, int]]:
+    """Every (pixel, start, end) that a mode may draw, by loops."""
+    origin = min(t for events in pixels.values() for t, _ in events)
+    pairs = []
+    for pixel, events in pixels.items():
+        instants = sorted({t for t, _ in events})
+        for i, start in enumerate(instants):
+            if mode == "window":
+                same_window = [t for t in instants if (t - origin) // WINDOW == (start - origin) // WINDOW]
+                ends = same_window[-1:] if start != same_window[-1] else []
+            else:
+                ends = instants[i + 1 : i + 1 + (1 if mode == "successor" else max_distance)]
+            pairs += [(pixel, start, end) for end in ends]
+    return pairs
+
+
+def rows(pairs: EventPairs) -> list[tuple[int, int, int]]:
+    return list(zip(pairs.pixels.tolist(), pairs.start.tolist(), pairs.end.tolist(), strict=True))
+
+
+def assert_counts_are_right(pairs: EventPairs, pixels: dict) -> None:
+    for (pixel, start, end), on, off in zip(rows(pairs), pairs.on.tolist(), pairs.off.tolist(), strict=True):
+        assert start < end
+        fired = [p for t, p in pixels[pixel] if start < t <= end]
+        assert (on, off) == (fired.count(1), fired.count(-1))
+
+
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize("max_distance", [1, 2, 3, 4, 7, 30])
+def test_every_partner_is_decoded_once(max_distance: int, equal_stamps: bool) -> None:
+    pixels = recording(equal_stamps)
+    sampler = EventPairSampler(index_of(pixels), "partner", max_distance)
+    expected = all_pairs(pixels, "partner", max_distance)
+    assert sampler.num_pairs == len(expected)
+    drawn = sampler.sample(60 * len(expected), torch.Generator().manual_seed(0))
+    assert set(rows(drawn)) == set(expected)
+
+
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize("uniform_over", ["pairs", "pixels"])
+@pytest.mark.parametrize("mode", MODES)
+def test_pairs_are_uniform_and_count_their_events(mode, uniform_over, equal_stamps: bool, device: str) -> None:
+    pixels = recording(equal_stamps)
+    expected = all_pairs(pixels, mode, 4)
+    sampler = EventPairSampler(index_of(pixels, device), mode, 4, WINDOW, uniform_over)
+    assert sampler.num_pairs == len(expected)
+
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(1))
+    assert pairs.pixels.device.type == device
+    assert {tensor.dtype for tensor in vars(pairs).values()} == {torch.int64}
+    assert_counts_are_right(pairs, pixels)
+
+    drawn = Counter(rows(pairs))
+    assert set(drawn) == set(expected)
+    per_pixel = Counter(pixel for pixel, _, _ in expected)
+    weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
+    assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
+
+
+def test_the_same_seed_draws_the_same_pairs() -> None:
+    sampler = EventPairSampler(index_of(recording(False)), "partner")
+    one, same, other = (rows(sampler.sample(100, torch.Generator().manual_seed(seed))) for seed in (3, 3, 4))
+    assert one == same != other
+
+
+def test_absolute_times_keep_their_nanoseconds() -> None:
+    late = 1_600_000_000_123_456_789
+    pixels = {3: [(late, 1), (late + 1, 1), (late + 3, -1)]}
+    pairs = EventPairSampler(index_of(pixels), "partner").sample(100, torch.Generator().manual_seed(0))
+    assert set(rows(pairs)) == {(3, late, late + 1), (3, late, late + 3), (3, late + 1, late + 3)}
+    assert_counts_are_right(pairs, pixels)
+
+
+def test_more_pairs_than_int32_holds() -> None:
+    count, distance = 70_000, 65_000
+    zero = np.zeros(count, np.uint16)
+    events = Events(x=zero, y=zero, t=np.arange(count), p=np.where(np.arange(count) % 3, 1, -1).astype(np.int8))
+    sampler = EventPairSampler(EventIndex.from_events(events, 1, 1), "partner", distance)
+    assert sampler.num_pairs == sum(count - d for d in range(1, distance + 1)) > 2**31
+    pairs = sampler.sample(50_000, torch.Generator().manual_seed(0))
+    gap = pairs.end - pairs.start
+    assert gap.min() >= 1 and gap.max() <= distance and pairs.end.max() < count
+    off = pairs.end // 3 - pairs.start // 3
+    assert torch.equal(pairs.off, off) and torch.equal(pairs.on, gap - off)
+    decile = np.array(
+        [sum(count - d for d in range(k * distance // 10 + 1, (k + 1) * distance // 10 + 1)) for k in range(10)]
+    )
+    drawn = np.bincount((gap.numpy() - 1) * 10 // distance, minlength=10)
+    assert chisquare(drawn, 50_000 * decile / decile.sum()).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("pixels", [{1: [(5, 1)], 2: [(6, -1)]}, {1: [(5, 1), (5, 1)]}])
+def test_no_pair_is_an_error(pixels: dict, mode) -> None:
+    with pytest.raises(ValueError, match="no pair"):
+        EventPairSampler(index_of(pixels), mode)
+
+
+def test_no_pair_in_any_window_is_an_error() -> None:
+    index = index_of({1: [(5, 1), (104, 1), (105, 1)], 2: [(204, -1), (205, -1)]})
+    assert EventPairSampler(index, "window", window_ns=100).num_pairs == 1
+    with pytest.raises(ValueError, match=r"within a window of 1e-06 ms"):
+        EventPairSampler(index, "window", window_ns=1)
+
+
+def test_no_event_at_all_is_an_error() -> None:
+    empty = EventIndex(
+        torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)
+    )
+    for mode in ("successor", "window"):
+        with pytest.raises(ValueError, match="no pair"):
+            EventPairSampler(empty, mode)
+
+
+def silent_stretches(pixels: dict, start: int, end: int) -> dict[int, list[tuple[int, int]]]:
+    """First and last instant of every stretch of each pixel without an event, by a loop over instants."""
+    stretches = defaultdict(list)
+    for pixel in range(WIDTH * HEIGHT):
+        times = {t for t, _ in pixels.get(pixel, [])}
+        begin = None
+        for instant in range(start, end + 2):
+            silent = instant <= end and instant not in times
+            if silent and begin is None:
+                begin = instant
+            elif not silent and begin is not None:
+                stretches[pixel].append((begin, instant - 1))
+                begin = None
+    return stretches
+
+
+@pytest.mark.parametrize(("start", "end"), [(START, END), (0, 1200), (300, 700)])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize(("min_duration", "max_duration"), [(1, 2), (20, 60), (200, 10_000)])
+def test_silent_pixels_are_silent(start, end, equal_stamps, min_duration, max_duration, device: str) -> None:
+    pixels = recording(equal_stamps)
+    pixels[1] = [(start, 1), (end, -1)]
+    stretches = silent_stretches(pixels, start, end)
+    long_enough = {pixel: [(a, b) for a, b in found if b - a >= min_duration] for pixel, found in stretches.items()}
+    sampler = SilentPixelSampler(index_of(pixels, device), start, end, min_duration, max_duration)
+    pairs = sampler.sample(3000, torch.Generator(device).manual_seed(2))
+    assert len(pairs) == 3000 and pairs.pixels.device.type == device
+    assert not pairs.on.any() and not pairs.off.any()
+    assert_counts_are_right(pairs, pixels)
+    for pixel, a, b in rows(pairs):
+        assert a < b <= a + max_duration
+        assert any(first <= a and b <= last for first, last in long_enough[pixel])
+    assert set(pairs.pixels.tolist()) == {pixel for pixel, found in long_enough.items() if found}
+
+
+def test_silent_pixels_are_drawn_in_proportion_to_their_silence() -> None:
+    pixels = recording(False)
+    sampler = SilentPixelSampler(index_of(pixels), START, END, 100, 400)
+    pairs = sampler.sample(20_000, torch.Generator().manual_seed(3))
+    stretches = silent_stretches(pixels, START, END)
+    silence = np.array([sum(b - a + 1 for a, b in stretches[pixel] if b - a >= 100) for pixel in range(WIDTH * HEIGHT)])
+    drawn = np.bincount(pairs.pixels.numpy(), minlength=WIDTH * HEIGHT)
+    assert not drawn[silence == 0].any()
+    expected = silence[silence > 0] * (20_000 / silence.sum())
+    assert chisquare(drawn[silence > 0], expected).pvalue > 1e-3
+
+
+def test_two_instants_of_a_silent_pixel_are_uniform() -> None:
+    pixels = {pixel: [(t, 1) for t in range(0, 100, 5)] for pixel in range(WIDTH * HEIGHT)}
+    sampler = SilentPixelSampler(index_of(pixels), 0, 99, 3, 1000)
+    pairs = sampler.sample(20_000, torch.Generator().manual_seed(4))
+    drawn = Counter((start % 5, end % 5) for _, start, end in rows(pairs))
+    expected = [(a, b) for a in range(1, 5) for b in range(a + 1, 5)]
+    assert set(drawn) == set(expected)
+    assert chisquare([drawn[pair] for pair in expected]).pvalue > 1e-3
+
+
+def test_rare_silence_still_fills_the_batch() -> None:
+    pixels = {pixel: [(t, 1) for t in range(0, 2000, 2)] for pixel in range(WIDTH * HEIGHT)}
+    pixels[4] = [(t, p) for t, p in pixels[4] if not 1000 < t < 1040]
+    pairs = SilentPixelSampler(index_of(pixels), 0, 1999, 20, 100).sample(5000, torch.Generator().manual_seed(0))
+    assert len(pairs) == 5000 and set(pairs.pixels.tolist()) == {4}
+    assert pairs.start.min() == 1001 and pairs.end.max() == 1039
+    assert_counts_are_right(pairs, pixels)
+
+
+def test_no_silence_gives_an_empty_batch() -> None:
+    pixels = {pixel: [(t, 1) for t in range(0, 100, 5)] for pixel in range(WIDTH * HEIGHT)}
+    pairs = SilentPixelSampler(index_of(pixels), 0, 99, 4, 1000).sample(64, torch.Generator().manual_seed(0))
+    assert len(pairs) == 0 and pairs.on.shape == pairs.end.shape == (0,)
+
+
+@pytest.mark.parametrize("arguments", [{"max_distance": 0}, {"window_ns": 0}])
+def test_impossible_pairs_are_refused(arguments: dict) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        EventPairSampler(index_of(recording(False)), "partner", **arguments)
+
+
+@pytest.mark.parametrize(("min_duration", "max_duration"), [(0, 10), (10, 1)])
+def test_impossible_durations_are_refused(min_duration: int, max_duration: int) -> None:
+    with pytest.raises(ValueError, match="at least"):
+        SilentPixelSampler(index_of(recording(False)), START, END, min_duration, max_duration)
