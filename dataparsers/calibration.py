@@ -88,7 +88,9 @@ class Camera:
         fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return Camera(self.width, self.height, fx, fy, cx, cy)
 
-    def undistort(self, image: Shaped[np.ndarray, "height width channels"]) -> Shaped[np.ndarray, "height width channels"]:
+    def undistort(
+        self, image: Shaped[np.ndarray, "height width channels"]
+    ) -> Shaped[np.ndarray, "height width channels"]:
         """The image as the camera `undistorted()` would have taken it, bilinearly interpolated, of the same type."""
         if self.model == "pinhole":
             return image

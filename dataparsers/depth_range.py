@@ -12,7 +12,6 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 
 GRID_WIDTH = 240  # of the view that votes are cast into, coarse enough for the number of events
 TILE = 16
-DEBUG=1
 EVENTS_PER_SWEEP = 20_000
 DISPARITIES = np.concatenate([np.arange(0.0, 8.0, 0.5), np.arange(8.0, 65.0)])  # grid pixels
 SMALLEST_DISPARITY, LARGEST_DISPARITY = 2.0, 60.0  # of a peak inside the swept range
@@ -24,8 +23,8 @@ MIN_VOTES = 0.1  # a grid pixel
 def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory) -> tuple[float, float]:
     """Near and far bound of the depth (along the optical axis) at which the event camera saw the scene, in metres.
 
-    A space sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018): the viewing rays of the events of an
-    edge meet where the edge is. Rays seen from within half a baseline of a reference view are cut by planes parallel to
+    A space sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018): the viewing rays of the events of
+    an edge meet where the edge is. Rays from within half a baseline of a reference view are cut by planes parallel to
     its image, evenly spaced in disparity. Where the cuts pile up is told, for each tile of the view, by the dispersion
     (variance over mean) of their counts; the variance is the objective of Gallego et al., "A Unifying Contrast
     Maximization Framework", CVPR 2018. Nothing depends on the unit of length: baselines are the extent of the camera's
@@ -50,7 +49,7 @@ def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory)
         path = trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
         extent = float(np.linalg.norm(np.ptp(path, axis=0)))
         generator = np.random.default_rng(0)
-        references = path_times[np.searchsorted(path_times, events.t[len(events) // 24 :: len(events) // 12 + 1])]
+        references = events.t[len(events) // 24 :: len(events) // 12 + 1]
     if extent > 0:
         sweeps = []
         for level in range(6):
@@ -62,22 +61,21 @@ def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory)
                 rays, centres = _in_view(
                     directions[events.y[chosen], events.x[chosen]],
                     trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
-                    trajectory.poses(torch.tensor(reference)).numpy(),
+                    trajectory.poses(torch.as_tensor(reference)).numpy(),
                 )
                 sweeps.append(_sweep(rays, centres / baseline, camera) * baseline)
         depths = np.concatenate(sweeps)
     if not len(depths):
         raise ValueError(
-            f"The depth of the scene cannot be measured: while its path spans {extent:.3g} m, {len(events)} events of the "
-            "camera show no parallax, so give the depth range."
+            f"The depth range of the scene cannot be measured, because the camera's path spans {extent:.3g} m and its "
+            f"{len(events)} events show no parallax: state the range."
         )
-    if DEBUG: print(len(depths), np.percentile(depths,[0,1,2,5,50,95,98,99,100]).round(2))
     near, far = np.percentile(depths, [2, 98])
     return 0.7 * float(near), 1.4 * float(far)
 
 
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
-    """Indices of the events around a time, for as long as the camera stays within a radius (metres) of its place then."""
+    """Indices of the events around a time, while the camera stays within a radius (metres) of its place then."""
     now = np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1)
     outside = np.flatnonzero(np.linalg.norm(path - path[now], axis=1) > radius)
     limits = np.concatenate([[0], outside, [len(path_times) - 1]])
@@ -91,7 +89,7 @@ def _in_view(
     poses: Float64[np.ndarray, "rays 3 4"],
     view: Float64[np.ndarray, "3 4"],
 ) -> tuple[Float64[np.ndarray, "rays 3"], Float64[np.ndarray, "rays 3"]]:
-    """Directions (z = 1) and centres of viewing rays in the axes of a view; rays that hardly go its way are left out."""
+    """Directions (z = 1) and centres of rays in the axes of a view; rays that hardly go its way are left out."""
     rays = np.einsum("nij,nj->ni", poses[:, :, :3], directions) @ view[:, :3]
     centres = (poses[:, :, 3] - view[:, 3]) @ view[:, :3]
     ahead = rays[:, 2] > 0.1

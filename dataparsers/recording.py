@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -138,8 +138,8 @@ class EventRecording:
         if backwards.any():
             bad = int(np.argmax(backwards)) + 1
             raise RecordingError(
-                f"{self._locate(bad)} goes back in time from {_seconds(events.t[bad - 1])} to {_seconds(events.t[bad])}, "
-                "but events must be in time order; sort them."
+                f"{self._locate(bad)} goes back in time from {_seconds(events.t[bad - 1])} to {_seconds(events.t[bad])}"
+                ", but events must be in time order; sort them."
             )
         polarities = events.p.view(np.int8) if events.p.dtype == bool else events.p
         bad = (polarities < -1) | (polarities > 1) if polarities.min() < -1 or polarities.max() > 1 else np.array([])
@@ -181,7 +181,7 @@ def read_recording(path: Path | str, format: str = "auto") -> EventRecording:
     return _read_recording(Path(path).resolve(), format)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _read_recording(path: Path, format: str) -> EventRecording:
     from enerf_ns.dataparsers import davis, esim  # here, since they import this module
 
@@ -200,8 +200,8 @@ def _read_recording(path: Path, format: str) -> EventRecording:
     names = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     listed = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     raise RecordingError(
-        f"{path} is a folder of no known format, since it must hold exactly one format's files ({looked_for}) but holds "
-        f"{listed or 'nothing'}."
+        f"{path} is a folder of no known format, since it must hold exactly one format's files ({looked_for}) but "
+        f"holds {listed or 'nothing'}."
     )
 
 
@@ -230,7 +230,7 @@ def check_image_size(path: Path, width: int, height: int) -> None:
     """
     if (found := image_size(path)) != (width, height):
         raise RecordingError(
-            f"{path} has {found[0]} x {found[1]} pixels, but the sensor has {width} x {height}; give frames of that size."
+            f"{path} has {found[0]} x {found[1]} pixels, but {width} x {height} as of the sensor were expected."
         )
 
 

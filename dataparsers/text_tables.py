@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.recording import RecordingError
-from enerf_ns.dataparsers.trajectory import Trajectory
 
 NANOSECONDS = {"s": Decimal(10) ** 9, "ns": Decimal(1)}
 
@@ -70,8 +69,8 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
             raise RecordingError(f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years.")
         if times and time <= times[-1]:
             raise RecordingError(
-                f"{path}, line {number} has the time {cell} {unit}, which is not after that of the row before; times must "
-                "increase from row to row."
+                f"{path}, line {number} has the time {cell} {unit}, which is not after that of the row before; times "
+                "must increase from row to row."
             )
         times.append(time)
     return np.array(times, dtype=np.int64)
@@ -98,13 +97,18 @@ def read_times(path: Path, unit: str) -> Int64[np.ndarray, " rows"]:
     return parse_times(path, [row[0] for row in rows], numbers, unit)
 
 
-def read_trajectory(path: Path, unit: str, notes: list[str]) -> tuple[Trajectory, int]:
+def read_poses(
+    path: Path, unit: str, notes: list[str]
+) -> tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]:
     """Poses, one a line: `t px py pz qx qy qz qw`, camera to world, OpenCV axes, metres.
 
     Args:
         path: The file.
         unit: Of the times, "s" or "ns".
         notes: Gets a sentence if quaternions had to be renormalised.
+
+    Returns:
+        times in nanoseconds, positions, and unit quaternions xyzw.
 
     Raises:
         RecordingError: The file is missing or empty, has fewer than two rows, a column too few or too many, something
@@ -121,8 +125,8 @@ def read_trajectory(path: Path, unit: str, notes: list[str]) -> tuple[Trajectory
     if (errors > QUATERNION_TOLERANCE).any():
         bad = int(np.argmax(errors > QUATERNION_TOLERANCE))
         raise RecordingError(
-            f"{path}, line {numbers[bad]} holds a quaternion of norm {norms[bad]:.6g}, but rotations are unit quaternions "
-            "(qx qy qz qw)."
+            f"{path}, line {numbers[bad]} holds a quaternion of norm {norms[bad]:.6g}, but rotations are unit "
+            "quaternions (qx qy qz qw)."
         )
     if (errors > 1e-6).any():
         notes.append(

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,7 +25,7 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.esim import EventGenerator
 from enerf_ns.simulator.render import EmbreeScene, Renderer
 from enerf_ns.simulator.scenes import SCENES
-from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND
+from enerf_ns.simulator.trajectories import MOTIONS
 
 CONSOLE = Console(width=120)
 
@@ -162,9 +163,8 @@ class Simulate:
         np.save(folder / "poses_bounds.npy", _llff_rows(frame_poses, size, (near, far)))
         settings = asdict(self)
         del settings["output_dir"]
-        camera = dict(
-            width=self.width, height=self.height, fx=focal_length, fy=focal_length, cx=self.width / 2, cy=self.height / 2
-        )
+        principal_point = {"cx": self.width / 2, "cy": self.height / 2}
+        camera = {"width": self.width, "height": self.height, "fx": focal_length, "fy": focal_length, **principal_point}
         about = {**settings, "camera": camera, "depth_range": [float(near), float(far)], "num_events": num_events}
         (folder / "simulation.json").write_text(json.dumps(about, indent=2) + "\n")
         return f"{num_events:,} events and {self.num_frames} frames of {self.duration:g} s"
@@ -188,7 +188,7 @@ def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, 
     poses = trajectory.poses(torch.from_numpy(trajectory.times)).numpy()
     rays = renderer.directions(*renderer.grid(8))
     displacement = [0.0]
-    for pose, following in zip(poses, poses[1:]):
+    for pose, following in pairwise(poses):
         depth = renderer.depth(pose, 8).reshape(-1, 1)
         world = rays * depth @ pose[:, :3].T + pose[:, 3]
         moved = (world - following[:, 3]) @ following[:, :3]
@@ -197,7 +197,7 @@ def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, 
     travelled = np.cumsum(displacement)
     at_stops = np.interp(stops, trajectory.times, travelled)
     times = [stops]
-    for first, second in zip(at_stops, at_stops[1:]):
+    for first, second in pairwise(at_stops):
         steps = int(np.ceil((second - first) / max_displacement))
         between = np.linspace(first, second, steps + 1)[1:-1]
         times.append(np.interp(between, travelled, trajectory.times).astype(np.int64))

@@ -76,7 +76,7 @@ def shapes(rng: np.random.Generator) -> Scene:
 def carpet(rng: np.random.Generator) -> Scene:
     """A plane of road-like lines, seen at a slant of 60 degrees from 1.5 metres away."""
     plane = _box((16, 16, 0.1), (0, 0, -0.05))
-    return _scene([(plane, textures.lines(rng, 100), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
+    return _scene([(plane, textures.lines(rng), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
 
 
 SCENES = {"shapes": shapes, "carpet": carpet}

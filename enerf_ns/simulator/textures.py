@@ -21,7 +21,7 @@ def clouds(rng: np.random.Generator, coarsest: float = 1.0, finest: float = 0.1)
     """Noise with a 1/f spectrum between two wavelengths in metres; all grey levels are equally frequent."""
     frequency = np.hypot(*np.meshgrid(*2 * [np.fft.fftfreq(SIZE) * TEXELS_PER_METRE]))
     band = np.where((frequency >= 1 / coarsest) & (frequency <= 1 / finest), 1.0, 0.0)
-    spectrum = np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * band / np.maximum(frequency, 1e-6) 
+    spectrum = np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * band / np.maximum(frequency, 1e-6)
     noise = np.fft.ifft2(spectrum).real
     levels = np.empty(noise.size, np.float32)
     levels[np.argsort(noise, axis=None)] = np.linspace(0, 1, noise.size)
@@ -45,12 +45,15 @@ def bricks(rng: np.random.Generator, width: float = 0.5, height: float = 0.25, j
     return image
 
 
-def lines(rng: np.random.Generator, count: int = 50, background: float = 0.35) -> np.ndarray:
+def lines(rng: np.random.Generator, count: int = 30, background: float = 0.35) -> np.ndarray:
     """Straight bright and dark strokes of random width, as roads on a map."""
     image = np.full((SIZE, SIZE), background, np.float32)
     for _ in range(count):
         ends = rng.integers(-SIZE // 4, SIZE + SIZE // 4, (2, 2))
-        cv2.line(image, *map(_point, ends), float(rng.choice([0.0, 0.7, 1.0])), int(rng.integers(8, 32)), cv2.LINE_AA)
+        grey, width = float(rng.choice([0.0, 0.7, 1.0])), int(rng.integers(8, 32))
+        for shift in np.ndindex(3, 3):  # what leaves at one border comes in at the opposite one
+            start, end = ends + SIZE * (np.array(shift) - 1)
+            cv2.line(image, start.tolist(), end.tolist(), grey, width, cv2.LINE_AA)
     return image
 
 
@@ -78,7 +81,3 @@ def mip_pyramid(image: np.ndarray) -> np.ndarray:
         half = len(levels[-1]) // 2
         levels.append(levels[-1].reshape(half, 2, half, 2).mean((1, 3)))
     return np.concatenate([level.ravel() for level in levels])
-
-
-def _point(xy: np.ndarray) -> tuple[int, int]:
-    return int(xy[0]), int(xy[1])

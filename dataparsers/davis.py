@@ -1,0 +1,252 @@
+"""Reader for the text format of the UZH event-camera dataset, recorded with a DAVIS240C.
+
+    events.txt        t x y p, one event a line; seconds, pixels, polarity 0 or 1
+    groundtruth.txt   t px py pz qx qy qz qw, one pose a line; camera to world, OpenCV axes, metres
+    calib.txt         fx fy cx cy k1 k2 p1 p2 k3
+    images.txt        t path, one frame a line (optional, with the images that it lists)
+
+Mueggler et al., "The event-camera dataset and simulator", International Journal of Robotics Research 36(2), 2017.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from rich.progress import Progress
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.recording import (
+    EventRecording,
+    Events,
+    Frames,
+    RecordingError,
+    check_image_size,
+    image_size,
+)
+from enerf_ns.dataparsers.text_tables import parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+FILES = ("events.txt", "groundtruth.txt", "calib.txt")
+
+DAVIS240C_SIZE = (240, 180)
+"""Width and height of the sensor in pixels, where there are no frames to tell."""
+
+EVENT_COLUMNS = "t_s x y p"
+BYTES_AT_A_TIME = 2**24
+BYTES_WITH_PROGRESS = 2 * 10**8
+"""Files from this size on take more than two seconds, so that a progress bar is shown."""
+
+
+def read(folder: Path) -> EventRecording:
+    """Reads all but the events, which are read when asked for.
+
+    The recording's zero of time is the earliest first stamp among events, frames and poses.
+
+    Args:
+        folder: With the files above.
+
+    Raises:
+        RecordingError: A file is missing or empty, or anything in it cannot be used.
+    """
+    notes: list[str] = []
+    events_file = folder / "events.txt"
+    pose_times, positions, quaternions = read_poses(folder / "groundtruth.txt", "s", notes)
+    frame_files, frame_times = _read_frame_list(folder, notes)
+    first_stamps = [_first_event_time(events_file), pose_times[0], *frame_times[:1]]
+    zero = int(min(first_stamps))
+
+    width, height = image_size(frame_files[0]) if frame_files else DAVIS240C_SIZE
+    for frame_file in frame_files:
+        check_image_size(frame_file, width, height)
+    camera = _read_camera(folder / "calib.txt", width, height)
+    trajectory = Trajectory(pose_times - zero, positions, quaternions)
+    return EventRecording(
+        path=folder,
+        format="davis",
+        camera=camera,
+        trajectory=trajectory,
+        load_events=lambda: _read_events(events_file, zero),
+        frames=Frames(frame_files, frame_times - zero, camera, trajectory) if frame_files else None,
+        notes=notes,
+        locate_event=lambda index: f"{events_file}, line {index + 1}",
+    )
+
+
+def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], np.ndarray]:
+    path = folder / "images.txt"
+    if not path.exists():
+        return (), np.zeros(0, np.int64)
+    rows, numbers = read_rows(path, "t_s path")
+    files = tuple(folder / row[1] for row in rows)
+    if not files[0].parent.is_dir():
+        notes.append(f"images.txt lists {len(files)} frames, but there is no folder {files[0].parent.name}/ of images.")
+        return (), np.zeros(0, np.int64)
+    for file, number in zip(files, numbers, strict=True):
+        if not file.is_file():
+            raise RecordingError(f"{path}, line {number} lists {file}, which is missing; add it or drop the line.")
+    return files, parse_times(path, [row[0] for row in rows], numbers, "s")
+
+
+def _read_camera(path: Path, width: int, height: int) -> Camera:
+    rows, numbers = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
+    fx, fy, cx, cy, *distortion = parse_numbers(path, rows, numbers)[0].tolist()
+    if fx <= 0 or fy <= 0:
+        raise RecordingError(f"{path} holds the focal lengths {fx:g} and {fy:g}, but they must be above 0 (pixels).")
+    if not any(distortion):
+        return Camera(width, height, fx, fy, cx, cy)
+    camera = Camera(width, height, fx, fy, cx, cy, tuple(distortion), "radtan")
+    try:
+        camera.pixel_directions()
+    except ValueError as error:
+        raise RecordingError(f"{path} (fx fy cx cy k1 k2 p1 p2 k3) fits no lens: {error}.") from error
+    return camera
+
+
+def _first_event_time(path: Path) -> int:
+    try:
+        with open(path, "rb") as file:
+            line = file.readline()
+    except OSError as error:
+        raise RecordingError(f"{path} is missing; a file of events ({EVENT_COLUMNS}) was expected.") from error
+    if not line.strip():
+        raise RecordingError(f"{path} is empty; events ({EVENT_COLUMNS}) were expected.")
+    columns = tuple(np.empty(1, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
+    if _line_parser()(np.frombuffer(line, np.uint8), *columns) == 0:
+        raise _bad_line(path, 1, line)
+    return int(columns[0][0])
+
+
+def _read_events(path: Path, zero: int) -> Events:
+    """All events as they are in the file, times in nanoseconds from `zero`."""
+    text = np.memmap(path, np.uint8, mode="r")
+    end = len(text)
+    while end and text[end - 1] in b" \t\r\n":
+        end -= 1
+    parse, pieces, num_events, start = _line_parser(), [], 0, 0
+    with Progress(transient=True, disable=len(text) < BYTES_WITH_PROGRESS) as progress:
+        task = progress.add_task(f"Reading {path.name}", total=end)
+        while start < end:
+            stop = min(start + BYTES_AT_A_TIME, end)
+            while stop < end and text[stop - 1] != ord("\n"):
+                stop += 1
+            piece = np.asarray(text[start:stop])
+            num_lines = np.count_nonzero(piece == ord("\n")) + (piece[-1] != ord("\n"))
+            columns = tuple(np.empty(num_lines, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
+            parsed = parse(piece, *columns)
+            if parsed < num_lines:
+                line = piece.tobytes().split(b"\n", parsed + 1)[parsed]
+                raise _bad_line(path, num_events + parsed + 1, line)
+            pieces.append(columns)
+            num_events += parsed
+            start = stop
+            progress.update(task, completed=start)
+    t, x, y, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    t -= zero
+    return Events(x, y, t, p)
+
+
+def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:
+    cells = line.decode(errors="replace").split()
+    if len(cells) != 4:
+        return RecordingError(
+            f"{path}, line {number} has {len(cells)} columns, but 4 were expected: {EVENT_COLUMNS}."
+        )
+    for cell, expected in zip(cells, ("a time in seconds", *["a whole number"] * 3), strict=True):
+        try:
+            value = Decimal(cell)
+            good = value.is_finite() and abs(value) < 2**31 and (expected != "a whole number" or value == int(value))
+        except InvalidOperation:
+            good = False
+        if not good:
+            return RecordingError(f"{path}, line {number} holds {cell!r} where {expected} was expected.")
+    return RecordingError(f"{path}, line {number} holds {' '.join(cells)!r}, but {EVENT_COLUMNS} was expected.")
+
+
+def _parse_lines(text, t, x, y, p):
+    """Fills one row per line of `text` (ASCII bytes), and returns how many it filled: fewer than len(t) at a bad line.
+
+    Numbers may have a sign, a decimal point and an exponent. Times become nanoseconds exactly, with no float between.
+    """
+    i = 0
+    for row in range(len(t)):
+        for column in range(4):
+            while i < len(text) and (text[i] == 32 or text[i] == 9):
+                i += 1
+            negative = i < len(text) and text[i] == 45  # -
+            if i < len(text) and (text[i] == 43 or text[i] == 45):
+                i += 1
+            mantissa, num_digits, significant = np.uint64(0), 0, 0
+            power = 9 if column == 0 else 0
+            after_point = False
+            while i < len(text):
+                if 48 <= text[i] <= 57:
+                    num_digits += 1
+                    if significant < 19:
+                        mantissa = mantissa * np.uint64(10) + np.uint64(text[i] - 48)
+                        significant += mantissa > 0
+                        power -= after_point
+                    else:
+                        power += not after_point
+                elif text[i] == 46 and not after_point:
+                    after_point = True
+                else:
+                    break
+                i += 1
+            if num_digits == 0:
+                return row
+            if i < len(text) and (text[i] == 101 or text[i] == 69):  # e, E
+                i += 1
+                below_one = i < len(text) and text[i] == 45
+                if i < len(text) and (text[i] == 43 or text[i] == 45):
+                    i += 1
+                exponent, num_digits = 0, 0
+                while i < len(text) and 48 <= text[i] <= 57 and num_digits < 4:
+                    exponent = exponent * 10 + (text[i] - 48)
+                    num_digits += 1
+                    i += 1
+                if num_digits == 0:
+                    return row
+                power += -exponent if below_one else exponent
+            while power > 0 and mantissa > 0:
+                if mantissa > np.uint64(2**58):
+                    return row
+                mantissa *= np.uint64(10)
+                power -= 1
+            while power < 0 and mantissa > 0:
+                if column > 0 and mantissa % np.uint64(10) > 0:
+                    return row
+                mantissa //= np.uint64(10)
+                power += 1
+            if mantissa >= np.uint64(2**62 if column == 0 else 2**31):
+                return row
+            value = -np.int64(mantissa) if negative else np.int64(mantissa)
+            if column == 0:
+                t[row] = value
+            elif column == 1:
+                x[row] = value
+            elif column == 2:
+                y[row] = value
+            else:
+                p[row] = value
+            if i < len(text) and text[i] != 32 and text[i] != 9 and text[i] != 13 and text[i] != 10:
+                return row
+        while i < len(text) and text[i] != 10:
+            if text[i] != 32 and text[i] != 9 and text[i] != 13:
+                return row
+            i += 1
+        i += 1
+    return len(t)
+
+
+@cache
+def _line_parser() -> Callable[..., int]:
+    import numba  # here, since importing it takes longer than reading a small recording
+
+    try:
+        return numba.njit(cache=True)(_parse_lines)
+    except RuntimeError:  # there is no folder to write the cache to
+        return numba.njit(_parse_lines)

@@ -1,0 +1,206 @@
+"""Reader for E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
+
+    events/*.npy                (n, 4) x y t_ns p, in time order over the files by name; a fifth column is ignored
+    *poses_all*.txt             t_ns px py pz qx qy qz qw after a header line; camera to world, OpenCV axes, metres
+    poses_bounds.npy            (N, 17) rows of LLFF, of which only height, width, focal length and the bounds are used
+    images/*.png                sharp frames (or .jpg), with images/image_stamps_ns.txt, one stamp a line (optional)
+    images_corrupted/*.png      frames blurred by motion, with an image_stamps_ns.txt of their own (optional)
+    depth/*.npy                 (height, width) depth in metres of each frame, 0 where nothing was hit (optional)
+    simulation.json             contrast_thresholds, depth_range and camera of the simulator (optional)
+
+One camera takes events and frames, without distortion, and stamps are nanoseconds from the simulation's zero.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.recording import (
+    EventRecording,
+    Events,
+    Frames,
+    RecordingError,
+    check_image_size,
+    load_array,
+)
+from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
+
+BYTES_WITH_PROGRESS = 10**9
+"""Events from this size on take more than two seconds to read, so that a progress bar is shown."""
+
+
+def read(folder: Path) -> EventRecording:
+    """Reads all but the events, which are read when asked for.
+
+    Args:
+        folder: With the files above.
+
+    Raises:
+        RecordingError: A file is missing or empty, or anything in it cannot be used.
+    """
+    notes: list[str] = []
+    poses_files = sorted(folder.glob("*poses_all*.txt"))
+    if not poses_files:
+        raise RecordingError(
+            f"{folder} holds no *poses_all*.txt; a file of poses (t_ns px py pz qx qy qz qw) was expected."
+        )
+    event_files = sorted((folder / "events").glob("*.npy"))
+    if not event_files:
+        raise RecordingError(f"{folder / 'events'} holds no .npy files; files of events (x y t_ns p) were expected.")
+    trajectory = Trajectory(*read_poses(poses_files[0], "ns", notes))
+    camera, depth_range = _read_poses_bounds(folder / "poses_bounds.npy")
+    simulation_file = folder / "simulation.json"
+    contrast_thresholds = None
+    if simulation_file.exists():
+        simulation = _read_simulation(simulation_file)
+        contrast_thresholds = _two_positive(simulation_file, simulation, "contrast_thresholds")
+        depth_range = _two_positive(simulation_file, simulation, "depth_range") or depth_range
+        camera = _simulated_camera(simulation_file, simulation) or camera
+
+    frames = _read_frames(folder / "images", camera, trajectory)
+    blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory)
+    starts: list[int] = []
+    return EventRecording(
+        path=folder,
+        format="esim",
+        camera=camera,
+        trajectory=trajectory,
+        load_events=lambda: _read_events(event_files, starts),
+        frames=frames,
+        blurred_frames=blurred_frames,
+        contrast_thresholds=contrast_thresholds,
+        depth_range=depth_range,
+        notes=notes,
+        locate_event=lambda index: _locate(event_files, starts, index),
+    )
+
+
+def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
+    rows = load_array(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise RecordingError(f"{path} holds an array of shape {rows.shape}, but (N, 17) was expected.")
+    height, width, focal_length = rows[0, :15].reshape(3, 5)[:, 4].tolist()
+    if not (_is_size(height) and _is_size(width) and 0 < focal_length < np.inf):
+        raise RecordingError(
+            f"{path} holds height {height:g}, width {width:g} and focal length {focal_length:g} in its first row, but "
+            "they must be above 0, and height and width whole pixels."
+        )
+    camera = Camera(int(width), int(height), focal_length, focal_length, width / 2, height / 2)
+    bounds = rows[:, 15:]
+    near, far = float(bounds[:, 0].min()), float(bounds[:, 1].max())
+    return camera, (near, far) if 0 < near < far < np.inf else None
+
+
+def _read_simulation(path: Path) -> dict:
+    try:
+        simulation = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path} cannot be read as JSON ({error}); simulate it again or remove it.") from error
+    if not isinstance(simulation, dict):
+        raise RecordingError(f"{path} holds a {type(simulation).__name__}, but a JSON object was expected.")
+    return simulation
+
+
+def _two_positive(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
+    value = simulation.get(name)
+    if value is None:
+        return None
+    if not (isinstance(value, list) and len(value) == 2 and all(_is_positive(number) for number in value)):
+        raise RecordingError(f"{path} holds {name} = {value}, but two numbers above 0 were expected.")
+    return float(value[0]), float(value[1])
+
+
+def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
+    camera = simulation.get("camera")
+    if camera is None:
+        return None
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    try:
+        width, height, fx, fy, cx, cy = (float(camera[name]) for name in names)
+        good = _is_size(width) and _is_size(height) and 0 < fx < np.inf and 0 < fy < np.inf
+        good = good and np.isfinite([cx, cy]).all()
+    except (TypeError, KeyError, ValueError):
+        good = False
+    if not good:
+        raise RecordingError(
+            f"{path} holds camera = {camera}, but the numbers {', '.join(names)} in pixels were expected."
+        )
+    return Camera(int(width), int(height), fx, fy, cx, cy)
+
+
+def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory) -> Frames | None:
+    files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
+    stamps_file = folder / "image_stamps_ns.txt"
+    if not files and not stamps_file.exists():
+        return None
+    times = read_times(stamps_file, "ns")
+    if len(times) != len(files):
+        raise RecordingError(
+            f"{folder} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; give one each."
+        )
+    for file in files:
+        check_image_size(file, camera.width, camera.height)
+    depth_folder = folder.parent / "depth"
+    depth_files = tuple(sorted(depth_folder.glob("*.npy")))
+    if not depth_files:
+        return Frames(files, times, camera, trajectory)
+    if len(depth_files) != len(files):
+        raise RecordingError(
+            f"{depth_folder} holds {len(depth_files)} depth maps, but {folder} holds {len(files)} images."
+        )
+    for file in depth_files:
+        shape = load_array(file, mmap_mode="r").shape
+        if shape != (camera.height, camera.width):
+            raise RecordingError(
+                f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
+                f"{(camera.height, camera.width)}."
+            )
+    return Frames(files, times, camera, trajectory, depth_files)
+
+
+def _read_events(files: list[Path], starts: list[int]) -> Events:
+    """All events as they are in the files; `starts` gets the index of each file's first event."""
+    columns: list[tuple[np.ndarray, ...]] = []
+    num_events = 0
+    large = sum(file.stat().st_size for file in files) >= BYTES_WITH_PROGRESS
+    for file in track(files, "Reading events", transient=True, disable=not large):
+        rows = load_array(file)
+        if rows.ndim != 2 or rows.shape[1] not in (4, 5):
+            raise RecordingError(f"{file} holds an array of shape {rows.shape}, but (n, 4) was expected: x y t_ns p.")
+        limits = (("x", 2**31), ("y", 2**31), ("t", 2**62), ("p", 2**31))
+        for column, (name, limit) in zip(rows.T, limits, strict=False):
+            if rows.dtype.kind == "f":
+                good = (np.abs(column) < limit) & ((column == np.rint(column)) | (name == "t"))
+                if not good.all():
+                    bad = int(np.argmin(good))
+                    expected = "a finite time in ns" if name == "t" else "a whole number"
+                    raise RecordingError(
+                        f"{file}, event {bad + 1} holds {name} = {column[bad]:g}, where {expected} was expected."
+                    )
+        x, y, p = (rows[:, i].astype(np.int32) for i in (0, 1, 3))
+        columns.append((x, y, np.rint(rows[:, 2]).astype(np.int64), p))
+        starts.append(num_events)
+        num_events += len(rows)
+    return Events(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def _locate(files: list[Path], starts: list[int], index: int) -> str:
+    file = bisect_right(starts, index) - 1
+    return f"{files[file]}, event {index - starts[file] + 1}"
+
+
+def _is_positive(number: object) -> bool:
+    return isinstance(number, (int, float)) and 0 < number < np.inf
+
+
+def _is_size(number: float) -> bool:
+    return 0 < number < 2**16 and number == int(number)

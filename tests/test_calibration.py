@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from enerf_ns.dataparsers.calibration import Camera
+
+PINHOLE = Camera(12, 10, 20.0, 21.0, 6.0, 4.5)
+RADTAN = Camera(
+    240, 180, 335.419462958, 335.352935612, 129.924663379, 99.1864303447,
+    (-0.138592767408, 0.0933736664192, -0.000335586987532, 0.000173720158228, 0.0), "radtan",
+)  # fmt: skip
+FISHEYE = Camera(
+    1280, 720, 1049.5831, 1049.4230, 634.7184, 263.4697, (-0.1151966, -0.0622218, 0.2168261, -0.2352862), "fisheye"
+)
+"""Real calibrations: slider_depth's DAVIS240C, and TUM-VIE's left event camera."""
+
+
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixels [N, 2] of points [N, 3], by OpenCV."""
+    no_motion, coefficients = np.zeros(3), np.array(camera.distortion)
+    if camera.model == "fisheye":
+        return cv2.fisheye.projectPoints(points[:, None], no_motion, no_motion, camera.matrix, coefficients)[0][:, 0]
+    return cv2.projectPoints(points, no_motion, no_motion, camera.matrix, coefficients)[0][:, 0]
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE], ids=lambda camera: camera.model)
+def test_directions_project_back_to_their_pixels(camera: Camera):
+    directions = camera.pixel_directions()
+    assert directions.shape == (camera.height, camera.width, 3)
+    np.testing.assert_array_equal(directions[..., 2], 1.0)
+    y, x = np.mgrid[: camera.height, : camera.width]
+    pixels = project(camera, directions.reshape(-1, 3)).reshape(camera.height, camera.width, 2)
+    np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1), atol=1e-6)
+
+
+def test_pinhole_directions_are_the_closed_form():
+    np.testing.assert_allclose(PINHOLE.pixel_directions()[2, 9], [(9 - 6.0) / 20.0, (2 - 4.5) / 21.0, 1.0])
+
+
+def test_pixel_directions_may_be_changed_by_the_caller():
+    first = PINHOLE.pixel_directions()
+    first[:] = 0.0
+    assert PINHOLE.pixel_directions()[..., 2].min() == 1.0
+
+
+def test_a_distortion_without_inverse_is_refused():
+    with pytest.raises(ValueError, match=r"radtan distortion .* has no inverse at [\d,]+ of the 240 x 180 pixels"):
+        Camera(240, 180, 100.0, 100.0, 120.0, 90.0, (-0.6, 0.2, 0.0, 0.0), "radtan").pixel_directions()
+
+
+def test_undistorted_camera_of_a_fisheye_has_the_published_intrinsics():
+    undistorted = FISHEYE.undistorted()
+    found = [undistorted.fx, undistorted.fy, undistorted.cx, undistorted.cy]
+    # E-NeRF's code states these for the same calibration
+    np.testing.assert_allclose(found, [982.706, 982.556, 632.791, 250.455], atol=0.06)
+    assert undistorted.model == "pinhole" and undistorted.distortion == ()
+
+
+@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=lambda camera: camera.model)
+def test_undistorted_image_shows_each_direction_where_the_pinhole_camera_sees_it(camera: Camera):
+    """The distorted image holds x and y of the undistorted pixel of each direction, so undistorting gives a ramp."""
+    undistorted = camera.undistorted()
+    expected = camera.pixel_directions() @ undistorted.matrix.T
+    ramp = camera.undistort(expected[..., :2].astype(np.float32))
+    y, x = np.mgrid[: camera.height, : camera.width]
+    inner = (slice(6, -6), slice(6, -6))
+    np.testing.assert_allclose(ramp[inner], np.stack([x, y], axis=-1)[inner], atol=0.05)
+
+
+def test_undistort_keeps_type_and_channels_and_leaves_pinhole_images_alone():
+    for channels in (1, 3):
+        image = np.full((180, 240, channels), 7, np.uint8)
+        undistorted = RADTAN.undistort(image)
+        assert undistorted.dtype == np.uint8 and undistorted.shape == image.shape
+        assert (undistorted[10:-10, 10:-10] == 7).all()
+    image = np.random.default_rng(0).integers(0, 256, (10, 12, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(PINHOLE.undistort(image), image)
+    assert PINHOLE.undistorted() == PINHOLE

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.depth_range import estimate_depth_range
+from enerf_ns.dataparsers.recording import Events, read_recording
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+PHASE = 2 * np.pi * np.linspace(0, 1, 2000)[:, None]
+
+
+def recording_of_points(points: np.ndarray, positions: np.ndarray, rotations: Rotation):
+    """Events of points (world, metres), one whenever a point enters a pixel, and the depths at which they were seen.
+
+    A tenth as many events are added at random. A pose is given each millisecond.
+    """
+    times = np.arange(len(positions)) * 1_000_000
+    seen = np.einsum("tji,tnj->tni", rotations.as_matrix(), points - positions[:, None])
+    x, y = np.rint(150 * seen[..., 0] / seen[..., 2] + 79.5), np.rint(150 * seen[..., 1] / seen[..., 2] + 59.5)
+    moved = np.zeros(x.shape, bool)
+    moved[1:] = (np.diff(x, axis=0) != 0) | (np.diff(y, axis=0) != 0)
+    step, point = np.nonzero(moved & (x >= 0) & (x < 160) & (y >= 0) & (y < 120) & (seen[..., 2] > 0.05))
+    x, y, depths = x[step, point], y[step, point], seen[step, point, 2]
+
+    generator = np.random.default_rng(0)
+    noise = len(step) // 10
+    step = np.append(step, generator.integers(0, len(times), noise))
+    x = np.append(x, generator.integers(0, 160, noise)).astype(np.uint16)
+    y = np.append(y, generator.integers(0, 120, noise)).astype(np.uint16)
+    order = np.argsort(step, kind="stable")
+    events = Events(x[order], y[order], times[step[order]], np.ones(len(step), np.int8))
+    return events, Trajectory(times, positions, rotations.as_quat()), depths
+
+
+def points_between(near: float, far: float) -> np.ndarray:
+    """250 points in front of the origin, their depths evenly spread over the octaves."""
+    generator = np.random.default_rng(1)
+    depths = np.exp(generator.uniform(np.log(near), np.log(far), (250, 1)))
+    return depths * np.append(generator.uniform(-0.6, 0.6, (250, 2)), np.ones((250, 1)), axis=1)
+
+
+def shaking(amplitude: float) -> np.ndarray:
+    return amplitude * np.concatenate([np.sin(3 * PHASE), np.sin(2 * PHASE + 1), np.sin(2.5 * PHASE + 3)], axis=1)
+
+
+STILL = Rotation.from_rotvec(np.zeros((2000, 3)))
+TURNING = Rotation.from_rotvec(
+    0.06 * np.concatenate([np.sin(2 * PHASE), np.sin(3 * PHASE + 2), np.sin(PHASE + 4)], axis=1)
+)
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "positions", "rotations"),
+    [
+        pytest.param(1.0, 3.0, PHASE * [0.16, 0, 0], STILL, id="sideways"),
+        pytest.param(1000.0, 3000.0, PHASE * [160, 0, 0], STILL, id="in other units"),
+        pytest.param(2.0, 100.0, shaking(0.5), TURNING, id="shaking, deep scene"),
+        pytest.param(1.0, 3.0, shaking(0.03), TURNING, id="shaking a little"),
+    ],
+)
+def test_range_holds_the_depths_of_the_points(near, far, positions, rotations):
+    events, trajectory, depths = recording_of_points(points_between(near, far), positions, rotations)
+    estimated_near, estimated_far = estimate_depth_range(events, CAMERA, trajectory)
+    true_near, true_far = np.percentile(depths, [1, 99])
+    assert 0.5 * true_near < estimated_near < true_near
+    assert true_far < estimated_far < 2 * true_far
+
+
+def test_an_orbit_around_a_ball():
+    generator = np.random.default_rng(2)
+    points = generator.normal(size=(400, 3))
+    points *= generator.uniform(0.2, 1.0, (400, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    angle = 0.9 * PHASE
+    positions = 3 * np.concatenate([np.sin(angle), 0 * angle, -np.cos(angle)], axis=1)
+    events, trajectory, depths = recording_of_points(points, positions, Rotation.from_euler("y", -angle))
+    near, far = estimate_depth_range(events, CAMERA, trajectory)
+    assert 1.0 < near < depths.min() and depths.max() < far < 8.0
+
+
+def test_a_camera_that_only_turns_is_refused():
+    events, trajectory, _ = recording_of_points(points_between(1, 3), np.zeros((2000, 3)), TURNING)
+    assert len(events) > 10_000
+    with pytest.raises(ValueError, match=r"spans 0 m .* no parallax"):
+        estimate_depth_range(events, CAMERA, trajectory)
+
+
+def test_events_without_structure_are_refused():
+    generator = np.random.default_rng(3)
+    x, y = generator.integers(0, 160, 20_000), generator.integers(0, 120, 20_000)
+    times = np.sort(generator.integers(0, 1_999_000_000, 20_000))
+    events = Events(x.astype(np.uint16), y.astype(np.uint16), times, np.ones(20_000, np.int8))
+    trajectory = Trajectory(np.arange(2000) * 1_000_000, PHASE * [0.16, 0, 0], STILL.as_quat())
+    with pytest.raises(ValueError, match="no parallax"):
+        estimate_depth_range(events, CAMERA, trajectory)
+
+
+@pytest.mark.slow
+def test_slider_depth(shared_data: Path):
+    """Its authors state depths of 0.45 to 2.07 m."""
+    recording = read_recording(shared_data / "slider_depth")
+    near, far = estimate_depth_range(recording.events, recording.camera, recording.trajectory)
+    assert 0.2 < near < 0.45 and 2.07 < far < 4.0

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SPECIFICATIONS = {
+    "nerfstudio.method_configs": "MethodSpecification",
+    "nerfstudio.dataparser_configs": "DataParserSpecification",
+}
+ENTRY_POINTS = [
+    (group, name, *target.split(":"))
+    for group, targets in PROJECT["entry-points"].items()
+    for name, target in targets.items()
+]
+PACKAGES = {"enerf_ns": ROOT / "enerf_ns", "enerf_ns.dataparsers": ROOT / "dataparsers"}
+MODULES = sorted(
+    ".".join([package, *file.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__")
+    for package, folder in PACKAGES.items()
+    for file in folder.rglob("*.py")
+)
+WITHOUT_NERFSTUDIO = [
+    module
+    for module in MODULES
+    if module.startswith(("enerf_ns.encodings", "enerf_ns.simulator", "enerf_ns.dataparsers"))
+    and module != "enerf_ns.dataparsers.event_dataparser"
+] + ["enerf_ns.event_sampler", "enerf_ns.event_camera", "enerf_ns.losses", "enerf_ns.ffmpeg"]
+
+
+def run_python(code: str, python: str | Path = sys.executable) -> str:
+    """Output of a fresh interpreter outside the source tree."""
+    run = subprocess.run([python, "-c", code], cwd=ROOT.parent, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def test_modules_below_the_plugin_import_no_nerfstudio():
+    loaded = run_python(
+        f"import importlib, sys\nfor module in {WITHOUT_NERFSTUDIO}: importlib.import_module(module)\n"
+        "print([name for name in sys.modules if name.split('.')[0] == 'nerfstudio'])"
+    )
+    assert loaded.strip() == "[]"
+
+
+def test_the_data_parsers_import_no_part_of_nerfstudio_that_imports_data_parsers():
+    """Nerfstudio's base data manager loads them while it is half imported itself."""
+    loaded = run_python(
+        "import sys, enerf_ns.dataparsers.event_dataparser\n"
+        "print(*(name for name in sys.modules if name.startswith('nerfstudio')))"
+    ).split()
+    forbidden = ("datamanagers", "pipelines", "trainer", "models", "method_configs", "dataparser_configs")
+    assert "nerfstudio.data.dataparsers.base_dataparser" in loaded
+    assert not [name for name in loaded if name.split(".")[-1] in forbidden]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", MODULES)
+def test_module_is_imported_first_by_a_fresh_interpreter(module):
+    run_python(f"import {module}")
+
+
+def test_entry_points_are_specifications():
+    for group, _, module, name in ENTRY_POINTS:
+        assert type(getattr(importlib.import_module(module), name)).__name__ == SPECIFICATIONS[group]
+
+
+@pytest.mark.slow
+def test_wheel_in_a_fresh_environment(tmp_path):
+    """The fresh environment sees the packages of this one behind its own, so that only the wheel is installed."""
+    source = tmp_path / "source"  # a copy: `pip wheel` builds in the source tree, and packs what an earlier build left
+    for folder in ("enerf_ns", "dataparsers"):
+        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, source)
+    pip_wheel = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, source]
+    subprocess.run(pip_wheel, check=True)
+    (wheel,) = tmp_path.glob("enerf_ns-*.whl")
+
+    environment = tmp_path / "environment"
+    venv.create(environment, symlinks=os.name != "nt", with_pip=True)
+    scripts = environment / ("Scripts" if os.name == "nt" else "bin")
+    subprocess.run([scripts / "python", "-m", "pip", "install", "--no-deps", wheel], check=True)
+    packages = Path(run_python("import sysconfig; print(sysconfig.get_path('purelib'))", scripts / "python").strip())
+    (packages / "packages_of_the_running_environment.pth").write_text(sysconfig.get_path("purelib"))
+
+    code = f"""
+import importlib, importlib.metadata
+for module in {MODULES}:
+    print("file", importlib.import_module(module).__file__)
+for group in {list(SPECIFICATIONS)}:
+    for point in importlib.metadata.distribution("enerf-ns").entry_points.select(group=group):
+        print("specification", group, point.name, type(point.load()).__name__)
+"""
+    lines = [line.split(maxsplit=1) for line in run_python(code, scripts / "python").splitlines()]
+    files = [Path(rest) for kind, rest in lines if kind == "file"]
+    assert len(files) == len(MODULES) and all(file.is_relative_to(packages / "enerf_ns") for file in files)
+    assert sorted(rest.split() for kind, rest in lines if kind == "specification") == sorted(
+        [group, name, SPECIFICATIONS[group]] for group, name, _, _ in ENTRY_POINTS
+    )
+    assert (packages / "enerf_ns" / "py.typed").is_file()
+    enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
+    assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from recordings import HEIGHT, WIDTH, write_davis, write_esim
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError, load_image, read_recording
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+CAMERA = Camera(WIDTH, HEIGHT, 20.0, 20.0, 12.0, 9.0)
+
+
+def recording(columns: np.ndarray, start: int = 0, end: int = 100, frame_times: tuple[int, ...] = ()) -> EventRecording:
+    """In memory, with poses from `start` to `end` ns and events of columns x y t p."""
+    trajectory = Trajectory(np.array([start, end]), np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
+    names = tuple(Path(f"{time}.png") for time in frame_times)
+    depth = tuple(Path(f"{time}.npy") for time in frame_times)
+    frames = Frames(names, np.array(frame_times), CAMERA, trajectory, depth) if frame_times else None
+    return EventRecording(Path("memory"), "test", CAMERA, trajectory, lambda: Events(*columns.T), frames)
+
+
+def test_events_have_the_types_that_everything_builds_on():
+    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]])).events
+    assert [column.dtype for column in (events.x, events.y, events.t, events.p)] == [
+        np.uint16, np.uint16, np.int64, np.int8,
+    ]  # fmt: skip
+    assert events.x.tolist() == [1, 1, 23] and events.y.tolist() == [2, 2, 17] and events.t.tolist() == [5, 6, 7]
+    assert len(events) == 3
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int64, np.uint8, bool])
+@pytest.mark.parametrize("off", [0, -1])
+def test_polarities_become_plus_and_minus_one(dtype: type, off: int):
+    if off == -1 and dtype in (np.uint8, bool):
+        pytest.skip("this type has no -1")
+    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [1, 2, 7, 1]]))
+    raw = events.load_events()
+    events.load_events = lambda: Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))
+    assert events.events.p.tolist() == [-1, 1, -1]
+
+
+def test_events_of_one_polarity_only_are_fine():
+    assert recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]])).events.p.tolist() == [1, 1]
+    assert recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]])).events.p.tolist() == [-1, -1]
+
+
+def test_events_outside_the_poses_are_dropped_and_counted():
+    times = np.array([9, 10, 10, 50, 100, 101])
+    rows = np.column_stack([np.full_like(times, 3), np.full_like(times, 4), times, np.ones_like(times)])
+    clipped = recording(rows, start=10)
+    assert clipped.events.t.tolist() == [10, 10, 50, 100]
+    assert clipped.notes == ["2 of 6 events (33 %) lie outside the poses and are left out."]
+    assert clipped.events is clipped.events
+
+
+def test_frames_outside_the_poses_are_dropped_and_counted():
+    rows = np.array([[1, 2, 5, 1], [1, 2, 6, 1]])
+    clipped = recording(rows, start=10, frame_times=(9, 10, 100, 101))
+    assert clipped.frames is not None and clipped.frames.times.tolist() == [10, 100]
+    assert clipped.frames.filenames == (Path("10.png"), Path("100.png"))
+    assert clipped.frames.depth_filenames == (Path("10.npy"), Path("100.npy"))
+    assert clipped.notes == ["2 of 4 frames (50 %) lie outside the poses and are left out."]
+    assert recording(rows, start=10, frame_times=(1, 2)).frames is None
+
+
+def test_nothing_is_noted_when_nothing_is_dropped():
+    whole = recording(np.array([[1, 2, 0, 1], [1, 2, 100, 1]]), frame_times=(0, 100))
+    assert len(whole.events) == 2 and whole.notes == []
+
+
+def test_read_recording_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    davis, esim = write_davis(tmp_path / "davis"), write_esim(tmp_path / "esim")
+    assert read_recording(davis).format == "davis"
+    assert read_recording(esim).format == "esim"
+    monkeypatch.chdir(tmp_path)
+    assert read_recording("esim") is read_recording(esim)
+
+
+@pytest.mark.parametrize(
+    ("mode", "channels"), [("L", 1), ("RGB", 3), ("RGBA", 3), ("LA", 1), ("P", 3), ("I;16", 1), ("1", 1)]
+)
+def test_load_image_gives_one_or_three_channels_of_uint8(tmp_path: Path, mode: str, channels: int):
+    grey = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 256
+    if mode == "I;16":
+        image = Image.fromarray((grey * 257).astype(np.uint16))
+    elif mode == "1":
+        grey = np.where(grey > 127, 255, 0)
+        image = Image.fromarray(grey.astype(np.uint8)).convert("1")
+    else:
+        image = Image.fromarray(grey.astype(np.uint8)).convert("RGB").convert(mode)
+    image.save(tmp_path / "image.png")
+    loaded = load_image(tmp_path / "image.png")
+    assert loaded.dtype == np.uint8 and loaded.shape == (HEIGHT, WIDTH, channels)
+    # a palette of 216 colours is coarse
+    np.testing.assert_allclose(loaded.astype(int), np.repeat(grey[..., None], channels, 2), atol=26 if mode == "P" else 0)
+
+
+def test_transparency_is_dropped(tmp_path: Path):
+    pixels = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "image.png")
+    np.testing.assert_array_equal(load_image(tmp_path / "image.png"), pixels[..., :3])
+
+
+def test_a_recording_error_is_a_value_error():
+    assert issubclass(RecordingError, ValueError)
