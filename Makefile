@@ -4,7 +4,7 @@
 # PYTHON=...   the interpreter to set up with (3.10 to 3.12)
 
 USABLE = import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
-PYTHON = $(shell for python in python3.12 python3.11 python3.10 python3; do \
+PYTHON ?= $(shell for python in python3.12 python3.11 python3.10 python3; do \
 	"$$python" -c '$(USABLE)' 2>/dev/null && echo "$$python" && break; done)
 # The name of the stamp changes with what it depends on, so that an unchanged set-up costs nothing, a fresh checkout included.
 STAMP := .venv/set-up-$(shell cat pyproject.toml constraints.txt | cksum | cut -d' ' -f1)

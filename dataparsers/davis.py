@@ -152,9 +152,7 @@ def _read_events(path: Path, zero: int) -> Events:
 def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:
     cells = line.decode(errors="replace").split()
     if len(cells) != 4:
-        return RecordingError(
-            f"{path}, line {number} has {len(cells)} columns, but 4 were expected: {EVENT_COLUMNS}."
-        )
+        return RecordingError(f"{path}, line {number} has {len(cells)} columns, but 4 were expected: {EVENT_COLUMNS}.")
     for cell, expected in zip(cells, ("a time in seconds", *["a whole number"] * 3), strict=True):
         try:
             value = Decimal(cell)

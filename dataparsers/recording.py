@@ -95,6 +95,10 @@ class EventRecording:
         self.frames = self._covered(self.frames, "frames")
         self.blurred_frames = self._covered(self.blurred_frames, "blurred frames")
 
+    def __deepcopy__(self, memo: dict) -> EventRecording:
+        """The recording itself: it is read-only and large, and Nerfstudio copies what it hands to data sets."""
+        return self
+
     @cached_property
     def events(self) -> Events:
         """All events between the first and the last pose, checked; polarity ±1. Read at first access.

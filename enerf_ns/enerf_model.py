@@ -69,6 +69,8 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the event loss."""
     no_event_loss_weight: float = 1.0
     """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
+    no_event_margin: float = 1.0
+    """Share of the threshold by which a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
     frame_loss_weight: float = 100.0
     """Weight of the loss on frames."""
     distortion_loss_weight: float = 0.01
@@ -219,9 +221,8 @@ class EnerfModel(Model):
                 loss = normalised_event_loss(predicted[:num_events], measured)
             losses["event_loss"] = config.event_loss_weight * loss
             if num_events < num_pairs:
-                losses["no_event_loss"] = config.no_event_loss_weight * no_event_loss(
-                    predicted[num_events:], thresholds
-                )
+                loss = no_event_loss(predicted[num_events:], thresholds, config.no_event_margin)
+                losses["no_event_loss"] = config.no_event_loss_weight * loss
         if "image" in batch:
             losses["frame_loss"] = config.frame_loss_weight * self.frame_error(outputs, batch)
         if self.training:

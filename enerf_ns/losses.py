@@ -35,19 +35,21 @@ def normalised_event_loss(
 
 
 def no_event_loss(
-    predicted: Float[Tensor, " pairs"], thresholds: tuple[float, float]
+    predicted: Float[Tensor, " pairs"], thresholds: tuple[float, float], margin: float = 1.0
 ) -> Float[Tensor, ""]:
-    """Mean of how far a silent pixel's rendered change goes beyond the thresholds it did not cross.
+    """Mean of how far a silent pixel's rendered change goes beyond what it may without an event.
 
-    Equation 7 of the paper with a threshold per polarity: relu(change - C_on) + relu(-change - C_off). In units of
-    the mean threshold.
+    Equation 7 of the paper with a threshold per polarity, in units of the mean threshold:
+    relu(change - margin * C_on) + relu(-change - margin * C_off). With margin 0 it is the mean absolute change, the
+    total variation of Deblur e-NeRF (Low and Lee, ECCV 2024), which also evens out what stays below the threshold.
 
     Args:
         predicted: Rendered change of log brightness between two instants with no event between them.
         thresholds: Contrast thresholds (C_on, C_off).
+        margin: Share of the threshold that costs nothing, from 0 to 1.
     """
     on, off = thresholds
-    excess = torch.relu(predicted - on) + torch.relu(-predicted - off)
+    excess = torch.relu(predicted - margin * on) + torch.relu(-predicted - margin * off)
     return torch.mean(excess) / (0.5 * (on + off))
 
 

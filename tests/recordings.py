@@ -57,7 +57,7 @@ def write_davis(folder: Path, frames: bool = True, zero: int = 0) -> Path:
     (folder / "groundtruth.txt").write_text(
         "".join(f"{seconds(zero + t)} {' '.join(map(repr, pose))}\n" for t, pose in rows)
     )
-    (folder / "calib.txt").write_text("33.0 34.0 11.5 8.5 -0.14 0.09 -0.0003 0.0002 0.0\n")
+    (folder / "calib.txt").write_text("330.0 340.0 11.5 8.5 -0.14 0.09 -0.0003 0.0002 0.0\n")
     if frames:
         (folder / "images").mkdir()
         lines = []
@@ -69,7 +69,11 @@ def write_davis(folder: Path, frames: bool = True, zero: int = 0) -> Path:
 
 
 def write_esim(
-    folder: Path, frames: tuple[str, ...] = ("images",), channels: int = 3, depth: bool = False, dtype: type = np.float64
+    folder: Path,
+    frames: tuple[str, ...] = ("images",),
+    channels: int = 3,
+    depth: bool = False,
+    dtype: type = np.float64,
 ) -> Path:
     """A recording in E-NeRF's ESIM layout: events in two files, frames in the folders named."""
     (folder / "events").mkdir(parents=True)

@@ -40,7 +40,9 @@ def test_a_file_without_events_is_fine(tmp_path: Path):
 def test_poses_and_camera(tmp_path: Path):
     recording = read_recording(write_esim(tmp_path / "esim"))
     np.testing.assert_array_equal(recording.trajectory.times, POSE_TIMES)
-    np.testing.assert_allclose(np.column_stack([recording.trajectory.positions, recording.trajectory.quaternions]), poses())
+    np.testing.assert_allclose(
+        np.column_stack([recording.trajectory.positions, recording.trajectory.quaternions]), poses()
+    )
     assert recording.camera == Camera(WIDTH, HEIGHT, 20.0, 20.0, WIDTH / 2, HEIGHT / 2)
     assert recording.depth_range == (0.5, 4.0)
     assert recording.contrast_thresholds is None
@@ -97,7 +99,9 @@ def test_small_errors_of_quaternions_are_renormalised(tmp_path: Path):
     np.savetxt(folder / "0_poses_all.txt", rows, header="t px py pz qx qy qz qw")
     recording = read_recording(folder)
     np.testing.assert_allclose(np.linalg.norm(recording.trajectory.quaternions, axis=1), 1.0, atol=1e-12)
-    assert recording.notes == ["1 of 11 quaternions in 0_poses_all.txt were off norm 1 by up to 0.0005 and are renormalised."]
+    assert recording.notes == [
+        "1 of 11 quaternions in 0_poses_all.txt were off norm 1 by up to 0.0005 and are renormalised."
+    ]
 
 
 @pytest.mark.parametrize("header", ["", "timestamp px py pz qx qy qz qw\n"])

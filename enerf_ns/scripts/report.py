@@ -82,7 +82,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, PICTURE_ROWS).round().astype(int))]
     has_frames = recording.frames is not None or recording.blurred_frames is not None
     height, width = chosen[0].recorded.shape[:2]
-    figure = Figure(figsize=(13, 3.15 * len(chosen) * height / width * 4 / 3), layout="constrained", dpi=120)
+    figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=120)
     axes = figure.subplots(len(chosen), 4, squeeze=False)
     near = min(float(view.depth.quantile(0.01)) for view in chosen)
     far = max(float(view.depth.quantile(0.99)) for view in chosen)

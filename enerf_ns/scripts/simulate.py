@@ -6,8 +6,8 @@ import json
 import os
 import shutil
 from collections import deque
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ from rich.progress import track
 from enerf_ns.dataparsers.recording import RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.esim import EventGenerator
-from enerf_ns.simulator.render import EmbreeScene, Renderer
+from enerf_ns.simulator.render import HAS_EMBREE, Renderer
 from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.trajectories import MOTIONS
 
@@ -41,15 +41,15 @@ class Simulate:
     motion: Literal["shake", "spiral"] = "shake"
     """How the camera moves: forward-facing with abrupt turns, or an inward spiral."""
     duration: float = 1.0
-    """Seconds."""
+    """Length of the recording in seconds."""
     num_frames: int = 41
     """Frames, at regular times."""
     exposure_ms: float = 20.0
     """Exposure of the blurred frames in milliseconds, centred at the time of the frame."""
     width: int = 160
-    """Pixels."""
+    """Of events and frames, in pixels."""
     height: int = 120
-    """Pixels."""
+    """Of events and frames, in pixels."""
     field_of_view: float = 60.0
     """Horizontal, in degrees."""
     contrast_thresholds: tuple[float, float] = (0.25, 0.25)
@@ -114,7 +114,7 @@ class Simulate:
 
         for name in ("images", "images_corrupted", "events", "depth"):
             (folder / name).mkdir()
-        if EmbreeScene is None:
+        if not HAS_EMBREE:
             CONSOLE.print("embreex is not installed: casting rays without Embree, several times slower.")
         generator: EventGenerator | None = None
         events: list[np.ndarray] = []
@@ -173,8 +173,8 @@ class Simulate:
 def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, max_displacement: float) -> np.ndarray:
     """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
 
-    Adds up, from pose to pose of the trajectory, the displacement of the pixel that moves most (every eighth pixel in
-    both directions is looked at), and divides the sum evenly between two stops.
+    Adds up, from pose to pose of the trajectory, the displacement of the pixel that moves most (of a grid over the
+    picture), and divides the sum evenly between two stops.
 
     Args:
         renderer: of the camera that moves.
@@ -186,10 +186,11 @@ def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, 
         int64 [N] nanoseconds, strictly increasing, from the first stop to the last, all stops among them.
     """
     poses = trajectory.poses(torch.from_numpy(trajectory.times)).numpy()
-    rays = renderer.directions(*renderer.grid(8))
+    columns, rows = np.linspace(0, renderer.width - 1, 24), np.linspace(0, renderer.height - 1, 18)
+    rays = renderer.rays(*np.meshgrid(columns, rows)).reshape(-1, 3)
     displacement = [0.0]
     for pose, following in pairwise(poses):
-        depth = renderer.depth(pose, 8).reshape(-1, 1)
+        depth = renderer.depth(pose, rays)[:, None]
         world = rays * depth @ pose[:, :3].T + pose[:, 3]
         moved = (world - following[:, 3]) @ following[:, :3]
         shift = renderer.focal_length * (moved[:, :2] / moved[:, 2:] - rays[:, :2])[depth[:, 0] > 0]
@@ -204,9 +205,11 @@ def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, 
     return np.unique(np.concatenate(times))
 
 
-def _ahead(threads: ThreadPoolExecutor, render, poses: np.ndarray) -> Iterator[np.ndarray]:
+def _ahead(
+    threads: ThreadPoolExecutor, render: Callable[[np.ndarray], np.ndarray], poses: np.ndarray
+) -> Iterator[np.ndarray]:
     """The pictures of all poses in order, rendered a few ahead of the one that is asked for."""
-    pending: deque = deque()
+    pending: deque[Future[np.ndarray]] = deque()
     for pose in poses:
         pending.append(threads.submit(render, pose))
         if len(pending) > 4:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 from numba import njit
 
 from enerf_ns.simulator.scenes import Scene
 from enerf_ns.simulator.textures import SIZE, TEXELS_PER_METRE
 
-try:
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-except ImportError:
-    EmbreeScene = None
+HAS_EMBREE = find_spec("embreex") is not None
+
+SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)])
+"""Where in a pixel, x and y from its centre, brightness is sampled: a rotated grid, no two in one row or column."""
 
 
 class Renderer:
@@ -25,46 +26,37 @@ class Renderer:
             layout assumes.
     """
 
-    samples = 2
-    """Rays along each side of a pixel."""
-
     def __init__(self, scene: Scene, width: int, height: int, focal_length: float):
         self.scene, self.width, self.height, self.focal_length = scene, width, height, focal_length
-        subpixel = (np.arange(self.samples) + 0.5) / self.samples - 0.5
-        self.rays = self.directions(
-            (np.arange(width)[:, None] + subpixel).ravel(), (np.arange(height)[:, None] + subpixel).ravel()
-        )
-        self.cast = (embree_caster if EmbreeScene else numba_caster)(scene)
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        self.centre_rays = self.rays(x, y)
+        self.sample_rays = self.rays(x[..., None] + SAMPLES[:, 0], y[..., None] + SAMPLES[:, 1])
+        self.cast = (embree_caster if HAS_EMBREE else numba_caster)(scene)
 
-    def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Rays of a grid of pixel coordinates, float64 [len(y) * len(x), 3], camera axes, z = 1."""
-        x, y = np.meshgrid(x, y)
+    def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Directions through pixel coordinates x and y of one shape, float64 [..., 3], camera axes, z = 1."""
         rays = np.stack([x - self.width / 2, y - self.height / 2, np.full(x.shape, self.focal_length)], axis=-1)
-        return rays.reshape(-1, 3) / self.focal_length
-
-    def grid(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows of every `step`-th pixel."""
-        return np.arange(0, self.width, step), np.arange(0, self.height, step)
+        return rays / self.focal_length
 
     def brightness(self, pose: np.ndarray) -> np.ndarray:
-        """Mean brightness of every pixel's area, float64 [height, width] in [0, 1].
+        """Mean brightness of every pixel's area, float64 [height, width] in [0, 1]; 0 where nothing is hit.
 
         Args:
             pose: float64 [3, 4], camera to world, OpenCV axes, metres.
         """
-        scene = self.scene
-        face, u, v, depth = self.cast(*_world(self.rays, pose))
-        samples = _shade(
-            face, u, v, depth, 1 / (self.focal_length * self.samples),
-            scene.triangles, scene.uv, scene.shade, scene.texture, scene.textures,
-        )  # fmt: skip
-        return samples.reshape(self.height, self.samples, self.width, self.samples).mean((1, 3))
+        scene, angle = self.scene, 1 / (2 * self.focal_length)
+        hits = self.cast(*_world(self.sample_rays.reshape(-1, 3), pose))
+        samples = _shade(*hits, angle, scene.triangles, scene.uv, scene.shade, scene.texture, scene.textures)
+        return samples.reshape(self.sample_rays.shape[:-1]).mean(-1)
 
-    def depth(self, pose: np.ndarray, step: int = 1) -> np.ndarray:
-        """z-depth in metres through the centre of every `step`-th pixel, float32 [height, width]; 0: nothing hit."""
-        x, y = self.grid(step)
-        face, _, _, depth = self.cast(*_world(self.directions(x, y), pose))
-        return np.where(face < 0, 0, depth).reshape(len(y), len(x))
+    def depth(self, pose: np.ndarray, rays: np.ndarray | None = None) -> np.ndarray:
+        """z-depth in metres along rays of camera axes [..., 3], float32 [...]; 0 where nothing is hit.
+
+        Without rays: through the centres of all pixels, [height, width].
+        """
+        rays = self.centre_rays if rays is None else rays
+        face, _, _, depth = self.cast(*_world(rays.reshape(-1, 3), pose))
+        return np.where(face < 0, 0, depth).astype(np.float32).reshape(rays.shape[:-1])
 
 
 @njit(cache=True, nogil=True)
@@ -84,6 +76,9 @@ def embree_caster(scene: Scene):
     These are, [N] each: the triangle (-1: none), its barycentric coordinates u and v (weights of the second and the
     third corner), and how many lengths of the direction the hit is away.
     """
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
     embree = EmbreeScene()
     TriangleMesh(embree, scene.triangles)
 
@@ -157,7 +152,7 @@ def _shade(face, u, v, depth, angle, triangles, uv, shade, texture, textures):  
         s = c * uv[f, 0, 0] + a * uv[f, 1, 0] + b * uv[f, 2, 0]
         t = c * uv[f, 0, 1] + a * uv[f, 1, 1] + b * uv[f, 2, 1]
         light = c * shade[f, 0] + a * shade[f, 1] + b * shade[f, 2]
-        level = np.log2(max(depth[i] * angle * TEXELS_PER_METRE, 1.0))
+        level = np.log2(min(max(depth[i] * angle * TEXELS_PER_METRE, 1.0), SIZE / 2))
         low = int(level)
         out[i] = light * (
             (low + 1 - level) * _texel(textures[texture[f]], low, s, t)

@@ -47,7 +47,7 @@ def shapes(rng: np.random.Generator) -> Scene:
     room.unmerge_vertices()
 
     def wall(*normal: int) -> trimesh.Trimesh:
-        return room.submesh([np.flatnonzero(room.face_normals @ normal > 0.5)], append=True)
+        return trimesh.Trimesh(room.vertices, room.faces[room.face_normals @ normal > 0.5], process=False)
 
     return _scene(
         [

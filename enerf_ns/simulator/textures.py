@@ -53,7 +53,7 @@ def lines(rng: np.random.Generator, count: int = 30, background: float = 0.35) -
         grey, width = float(rng.choice([0.0, 0.7, 1.0])), int(rng.integers(8, 32))
         for shift in np.ndindex(3, 3):  # what leaves at one border comes in at the opposite one
             start, end = ends + SIZE * (np.array(shift) - 1)
-            cv2.line(image, start.tolist(), end.tolist(), grey, width, cv2.LINE_AA)
+            cv2.line(image, start.tolist(), end.tolist(), (grey,), width, cv2.LINE_AA)
     return image
 
 
@@ -63,7 +63,7 @@ def text(rng: np.random.Generator, line_height: float = 0.2, background: float =
     step = round(line_height * TEXELS_PER_METRE)
     for baseline in range(step, SIZE + step, step):
         row = "".join(rng.choice(list(string.ascii_uppercase + "   "), 64))
-        cv2.putText(image, row, (-8, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.028 * step, 0.0, step // 8, cv2.LINE_AA)
+        cv2.putText(image, row, (-8, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.028 * step, (0.0,), step // 8, cv2.LINE_AA)
     return image
 
 
