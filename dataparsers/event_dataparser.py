@@ -114,10 +114,23 @@ class EventDataParser(DataParser):
 
 
 def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tuple[float, float]:
-    """Nearest and farthest depth in metres: from the flag, the recording, or its events, in this order."""
-    return config.depth_range or recording.depth_range or estimate_depth_range(
-        recording.events, recording.camera, recording.trajectory
-    )
+    """Nearest and farthest depth in metres: from the flag, the recording, or its events, in this order.
+
+    Raises:
+        RecordingError: if the flag is no range, or the events do not show how deep the scene is.
+    """
+    chosen = config.depth_range or recording.depth_range
+    if chosen is None:
+        try:
+            chosen = estimate_depth_range(recording.events, recording.camera, recording.trajectory)
+        except ValueError as error:
+            raise RecordingError(
+                f"{recording.path}: {str(error).rstrip('.')}, as metres NEAR FAR after --depth-range of the data parser."
+            ) from error
+    near, far = chosen
+    if not 0.0 < near < far < np.inf:
+        raise RecordingError(f"{recording.path}: the depth range is {near} to {far} m; expected 0 < near < far")
+    return near, far
 
 
 def scene_normalisation(recording: EventRecording, near: float, far: float) -> tuple[np.ndarray, float, np.ndarray]:

@@ -114,10 +114,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """Rays of one step, and what was seen along them.
 
         Returns:
-            Rays in the order of `PairedRayBundle`, event pairs before silent ones, and a batch of: `on`, `off`
-            (event pairs,), the numbers of events of each polarity between the two instants; `num_pairs`, event pairs and
-            silent ones; `image` (frame rays, 3) in [0, 1] where the field learns from frames. A loaded run, which is not training, draws pixels
-            evenly from its cameras.
+            Rays in the order of `PairedRayBundle`, event pairs before silent ones, and a batch of: `num_pairs`, event
+            pairs and silent ones; `on` and `off` (event pairs,), the numbers of events of each polarity between the
+            two instants; `image` (frame rays, 3) in [0, 1] where the field learns from frames. A loaded run, which is
+            not training, draws pixels evenly from its cameras.
         """
         self.train_count += 1
         if self.test_mode != "val":

@@ -12,7 +12,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import (
-    LinearDisparitySampler,
     PDFSampler,
     ProposalNetworkSampler,
     UniformSampler,
@@ -70,7 +69,7 @@ class EnerfModelConfig(ModelConfig):
     no_event_loss_weight: float = 1.0
     """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
     no_event_margin: float = 1.0
-    """Share of the threshold by which a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
+    """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
     frame_loss_weight: float = 100.0
     """Weight of the loss on frames."""
     distortion_loss_weight: float = 0.01
@@ -143,7 +142,9 @@ class EnerfModel(Model):
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return {"fields": list(self.field.parameters()) + list(self.proposal.parameters() if self.proposal else [])}
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
         if self.proposal is None:
             return []
         return [

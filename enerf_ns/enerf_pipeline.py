@@ -92,7 +92,7 @@ class EnerfPipeline(VanillaPipeline):
             aligned, (scale, offset) = align_brightness(
                 [view.rendered for view in views], [view.recorded for view in views]
             )
-            for view, image in zip(views, aligned):
+            for view, image in zip(views, aligned, strict=True):
                 view.rendered = image
             summary |= {"brightness_scale": scale, "brightness_offset": offset}
         self.train()

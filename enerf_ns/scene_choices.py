@@ -48,8 +48,8 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
     has_frames = recording.frames is not None or recording.blurred_frames is not None
     if use_frames and not has_frames:
         raise RecordingError(
-            f"{recording.path}: the recording holds no frames, but --pipeline.datamanager.supervision {data.supervision} "
-            "learns from them; use --pipeline.datamanager.supervision events"
+            f"{recording.path}: the recording holds no frames, but --pipeline.datamanager.supervision "
+            f"{data.supervision} learns from them; use --pipeline.datamanager.supervision events"
         )
 
     if use_events:

@@ -36,9 +36,7 @@ def load_lpips() -> nn.Module | None:
         return None
 
 
-def lpips(
-    rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"]
-) -> float | None:
+def lpips(rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"]) -> float | None:
     """Perceptual distance of two pictures in [0, 1]; None where the weights are missing."""
     network = load_lpips()
     if network is None:

@@ -87,7 +87,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     near = min(float(view.depth.quantile(0.01)) for view in chosen)
     far = max(float(view.depth.quantile(0.99)) for view in chosen)
     titles = ("held-out frame" if has_frames else "events", "render", "depth", "events")
-    for row, view in zip(axes, chosen):
+    for row, view in zip(axes, chosen, strict=True):
         row[0].imshow(view.recorded.clamp(0, 1).numpy())
         row[1].imshow(view.rendered.clamp(0, 1).numpy())
         depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo_r", vmin=near, vmax=far)
@@ -96,7 +96,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
-    for axis, title in zip(axes[0], titles):
+    for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title)
     figure.colorbar(depth, ax=axes[:, 2], label="metres", shrink=0.8)
     figure.savefig(path)
