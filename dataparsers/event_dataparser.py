@@ -125,7 +125,7 @@ def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tup
             chosen = estimate_depth_range(recording.events, recording.camera, recording.trajectory)
         except ValueError as error:
             raise RecordingError(
-                f"{recording.path}: {str(error).rstrip('.')}, as metres NEAR FAR after --depth-range of the data parser."
+                f"{recording.path}: {str(error).rstrip('.')}, with --depth-range NEAR FAR of the data parser (metres)."
             ) from error
     near, far = chosen
     if not 0.0 < near < far < np.inf:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from pathlib import Path
+from pickle import UnpicklingError
 
 import torch
 from jaxtyping import Float
@@ -28,9 +29,10 @@ def load_lpips() -> nn.Module | None:
         layers = {name: f"{name.split('.', 1)[1]}" for name in network.net.state_dict()}
         network.net.load_state_dict({name: weights[layer] for name, layer in layers.items()})
         return network
-    except (OSError, KeyError, RuntimeError) as error:
+    except (OSError, EOFError, KeyError, RuntimeError, UnpicklingError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         print(
-            f"LPIPS is left out: the AlexNet weights could not be loaded ({type(error).__name__}: {error}); "
+            f"LPIPS is left out: the AlexNet weights could not be loaded ({reason}); "
             f"set {WEIGHTS_VARIABLE} to a file with the state dict of torchvision's alexnet().features."
         )
         return None

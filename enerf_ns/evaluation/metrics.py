@@ -45,7 +45,7 @@ def image_metrics(
     psnr = -10.0 * torch.log10(torch.mean((rendered - recorded) ** 2).clamp(min=1e-12))
     pictures = [image.movedim(-1, 0)[None] for image in (rendered, recorded)]
     ssim = structural_similarity_index_measure(pictures[0], pictures[1], data_range=1.0)
-    correlation = torch.corrcoef(torch.stack([rendered.flatten(), recorded.flatten()]))[0, 1].nan_to_num()
+    correlation = torch.corrcoef(torch.stack([rendered.flatten(), recorded.flatten()]).double())[0, 1].nan_to_num()
     return {"psnr": float(psnr), "ssim": float(ssim), "correlation": float(correlation)}
 
 

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from enerf_ns.event_camera import (
+    DEFAULT_CONTRAST_THRESHOLD,
+    inverse_linlog,
+    linlog,
+    luma,
+    measured_change,
+    thresholds_from_polarity,
+)
+
+KNEE = 20.0 / 255.0
+
+
+@pytest.mark.parametrize(
+    ("level", "expected"),
+    [(0.0, 0.0), (10.0, 0.5 * math.log(20)), (20.0, math.log(20)), (100.0, math.log(100)), (255.0, math.log(255))],
+)
+def test_linlog_of_a_grey_level(level: float, expected: float):
+    assert linlog(torch.tensor(level / 255.0, dtype=torch.float64)).item() == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("level", "expected"),
+    [(0.0, math.log(20) / 20), (19.9, math.log(20) / 20), (20.0, 1 / 20), (20.1, 1 / 20.1), (200.0, 1 / 200)],
+)
+def test_slope_of_linlog_per_grey_level(level: float, expected: float):
+    brightness = torch.tensor(level / 255.0, dtype=torch.float64, requires_grad=True)
+    linlog(brightness).backward()
+    assert brightness.grad is not None
+    assert brightness.grad.item() / 255.0 == pytest.approx(expected, rel=1e-12)
+
+
+def test_linlog_is_continuous_at_the_knee_and_increasing():
+    below, above = linlog(torch.tensor([KNEE - 1e-9, KNEE + 1e-9], dtype=torch.float64)).tolist()
+    assert above - below == pytest.approx(0.0, abs=1e-6)
+    assert (linlog(torch.linspace(-0.1, 1.0, 1000, dtype=torch.float64)).diff() > 0).all()
+
+
+def test_inverse_linlog_undoes_linlog():
+    brightness = torch.linspace(-0.1, 1.2, 1301, dtype=torch.float64)
+    torch.testing.assert_close(inverse_linlog(linlog(brightness)), brightness, rtol=0, atol=1e-12)
+    assert inverse_linlog(torch.tensor(math.log(100.0))).item() == pytest.approx(100 / 255)
+
+
+def test_luma_is_the_grey_of_opencv():
+    rgb = np.random.default_rng(0).random((4, 5, 3), dtype=np.float32)
+    np.testing.assert_allclose(luma(torch.from_numpy(rgb)), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), atol=1e-5)
+
+
+def test_luma_of_one_channel_is_that_channel():
+    grey = torch.rand(4, 5, 1)
+    torch.testing.assert_close(luma(grey), grey[..., 0], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("thresholds", [(0.25, 0.25), (0.2, 0.35)])
+def test_measured_change_of_a_ramp(thresholds: tuple[float, float]):
+    """A pixel that brightens, and then darkens, by 2.0 in log brightness, one event each time a threshold is passed."""
+    rises, falls = int(2.0 / thresholds[0]), int(2.0 / thresholds[1])
+    changes = measured_change(torch.tensor([rises, 0, rises]), torch.tensor([0, falls, falls]), thresholds)
+    assert changes[0].item() == pytest.approx(2.0, abs=thresholds[0])
+    assert changes[1].item() == pytest.approx(-2.0, abs=thresholds[1])
+    assert changes[2].item() == pytest.approx(changes[0].item() + changes[1].item(), abs=1e-6)
+
+
+def test_thresholds_balance_the_polarities():
+    on, off = thresholds_from_polarity(100, 141)
+    assert 100 * on == pytest.approx(141 * off)
+    assert (on + off) / 2 == pytest.approx(DEFAULT_CONTRAST_THRESHOLD)
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (7, 0), (0, 7), (7, 7)])
+def test_thresholds_are_equal_where_polarities_are_or_one_is_missing(counts: tuple[int, int]):
+    assert thresholds_from_polarity(*counts) == (DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD)

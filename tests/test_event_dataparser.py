@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from recordings import EVENTS, FRAME_TIMES, POSE_TIMES, poses, write_davis, write_esim
+from scipy.interpolate import CubicSpline
+from scipy.optimize import root
+from scipy.spatial.transform import Rotation, Slerp
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.event_dataparser import (
+    DavisDataParserConfig,
+    EsimDataParserConfig,
+    EventDataParserConfig,
+    scene_normalisation,
+)
+from enerf_ns.dataparsers.recording import RecordingError, read_recording
+from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
+from enerf_ns.event_dataset import EventDataset
+
+NEAR, FAR = 0.5, 4.0
+FORMATS = {"esim": write_esim, "davis": write_davis}
+
+
+def parse(folder: Path, split: str = "train", **options) -> DataparserOutputs:
+    config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR), **options)
+    return config.setup().get_dataparser_outputs(split)
+
+
+def world_to_camera(time: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation vector and translation as OpenCV takes them, from SciPy's interpolation of the poses in the file."""
+    rotation = Slerp(POSE_TIMES, Rotation.from_quat(poses()[:, 3:]))(time)
+    position = CubicSpline(POSE_TIMES, poses()[:, :3])(time)
+    return rotation.inv().as_rotvec(), -rotation.inv().apply(position)
+
+
+def project(point: np.ndarray, time: int, camera: Camera) -> np.ndarray:
+    """Pixel (x, y), integer at pixel centres, where a camera sees a point of the world; by OpenCV."""
+    rotation, translation = world_to_camera(time)
+    distortion = np.array(camera.distortion) if camera.distortion else None
+    return cv2.projectPoints(point[None], rotation, translation, camera.matrix, distortion)[0][0, 0]
+
+
+def unproject(pixel: np.ndarray, depth: float, time: int, camera: Camera) -> np.ndarray:
+    """The point of the world at a depth (along the optical axis) that OpenCV projects to a pixel, by root finding."""
+    rotation = Rotation.from_rotvec(world_to_camera(time)[0])
+    translation = world_to_camera(time)[1]
+
+    def world(image_plane: np.ndarray) -> np.ndarray:
+        return rotation.inv().apply(depth * np.array([*image_plane, 1.0]) - translation)
+
+    found = root(lambda image_plane: project(world(image_plane), time, camera) - pixel, [0.0, 0.0], tol=1e-12)
+    np.testing.assert_allclose(project(world(found.x), time, camera), pixel, atol=1e-6)
+    return world(found.x)
+
+
+def distance_to_rays(rays: RayBundle, points: np.ndarray, outputs: DataparserOutputs) -> np.ndarray:
+    """How far the rays pass by points of the world, in scene units."""
+    transform = outputs.dataparser_transform.double().numpy()
+    scene = outputs.dataparser_scale * (points @ transform[:, :3].T + transform[:, 3])
+    towards = scene - rays.origins.double().numpy()
+    directions = rays.directions.double().numpy()
+    along = np.sum(towards * directions, axis=-1)
+    assert (along > 0).all(), "the points lie behind the camera"
+    return np.linalg.norm(towards - along[:, None] * directions, axis=-1)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_camera_ray_through_the_projection_of_a_point_meets_the_point(tmp_path: Path, format: str):
+    folder = FORMATS[format](tmp_path / format)
+    outputs = parse(folder)
+    camera = read_recording(folder).camera.undistorted()
+    frames = outputs.metadata["frames"]
+    random = np.random.default_rng(0)
+    points, rays = [], []
+    for i, time in enumerate(frames.times.tolist()):
+        for _ in range(5):
+            pixel = random.uniform([0, 0], [camera.width - 1, camera.height - 1])
+            points.append(unproject(pixel, random.uniform(NEAR, FAR), time, camera))
+            coordinates = torch.from_numpy(pixel[::-1] + 0.5).float()
+            rays.append(outputs.cameras.generate_rays(camera_indices=i, coords=coordinates))
+    bundle = RayBundle(
+        origins=torch.stack([ray.origins for ray in rays]),
+        directions=torch.stack([ray.directions for ray in rays]),
+        pixel_area=torch.ones(len(rays), 1),
+    )
+    assert distance_to_rays(bundle, np.array(points), outputs).max() < 1e-5
+
+
+def test_the_ray_of_a_picture_element_goes_through_its_centre(tmp_path: Path):
+    """Element [row, column] of a picture is pixel (column, row) of OpenCV."""
+    folder = write_esim(tmp_path / "esim")
+    outputs = parse(folder)
+    rays = outputs.cameras.generate_rays(camera_indices=1, keep_shape=True)
+    time = int(outputs.metadata["frames"].times[1])
+    camera = read_recording(folder).camera
+    for row, column in ((0, 0), (17, 23), (5, 11)):
+        point = unproject(np.array([column, row]), 2.0, time, camera)
+        assert distance_to_rays(rays[row : row + 1, column], point[None], outputs).max() < 1e-5
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_an_event_ray_meets_every_point_that_the_pixel_sees_at_that_time(tmp_path: Path, format: str):
+    """With lens distortion for davis; between two poses."""
+    folder = FORMATS[format](tmp_path / format)
+    parser = EventDataParserConfig(depth_range=(NEAR, FAR))
+    manager = EnerfDataManagerConfig(data=folder, dataparser=parser).setup(device="cpu", test_mode="val")
+    assert isinstance(manager, EnerfDataManager)
+    camera = read_recording(folder).camera
+    pixels = np.array([[0, 0], [23, 17], [3, 4], [12, 9]])
+    times = np.array([0, 123_456_789, 550_000_001, 1_000_000_000])
+    depths = [0.5, 1.0, 2.0, 4.0]
+    points = [unproject(p, z, int(t), camera) for p, z, t in zip(pixels, depths, times, strict=True)]
+    rays = manager.event_rays(torch.from_numpy(pixels[:, 1] * 24 + pixels[:, 0]), torch.from_numpy(times))
+    assert distance_to_rays(rays, np.array(points), manager.train_dataparser_outputs).max() < 1e-5
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(4))
+
+
+def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
+    """At a frame's time, the ray of a pixel is the ray of the picture's element, with the same bookkeeping."""
+    folder = write_esim(tmp_path / "esim")
+    manager = EnerfDataManagerConfig(data=folder, dataparser=EventDataParserConfig()).setup(device="cpu")
+    time = int(manager.train_dataset.frames.times[0])
+    frame = manager.train_dataset.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
+    event = manager.event_rays(torch.arange(24 * 18), torch.full((24 * 18,), time))
+    torch.testing.assert_close(event.origins, frame.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(event.directions, frame.directions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(event.metadata["directions_norm"], frame.metadata["directions_norm"])
+    assert event.pixel_area[0].item() == pytest.approx(1 / 20**2)
+
+
+def test_the_box_holds_what_the_camera_sees_between_near_and_far(tmp_path: Path):
+    folder = write_davis(tmp_path / "davis")
+    recording = read_recording(folder)
+    transform, scale, box = scene_normalisation(recording, NEAR, FAR)
+    assert np.ptp(box, axis=0).max() == pytest.approx(2.0)
+    np.testing.assert_allclose(box.sum(axis=0), 0.0, atol=1e-9)
+
+    random = np.random.default_rng(0)
+    seen = []
+    for time in random.integers(recording.trajectory.start, recording.trajectory.end, 20):
+        for corner in ((0, 0), (23, 0), (0, 17), (23, 17)):
+            seen += [unproject(np.array(corner), depth, int(time), recording.camera) for depth in (NEAR, FAR)]
+    points = scale * (np.array(seen) @ transform[:, :3].T + transform[:, 3])
+    assert (points > box[0] - 1e-3).all() and (points < box[1] + 1e-3).all()
+    assert (np.ptp(points, axis=0) > 0.9 * np.ptp(box, axis=0)).all(), "the box is not much larger than that"
+
+
+def test_the_mean_up_direction_of_the_cameras_is_z(tmp_path: Path):
+    outputs = parse(write_esim(tmp_path / "esim"))
+    up = outputs.cameras.camera_to_worlds[:, :, 1].mean(dim=0)
+    torch.testing.assert_close(up / up.norm(), torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=1e-5)
+
+
+def test_the_transform_that_is_written_takes_the_world_to_the_scene(tmp_path: Path):
+    outputs = parse(write_esim(tmp_path / "esim"))
+    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
+    written = json.loads((tmp_path / "dataparser_transforms.json").read_text())
+    transform, scale = np.array(written["transform"]), written["scale"]
+    centres = CubicSpline(POSE_TIMES, poses()[:, :3])(outputs.metadata["frames"].times)
+    expected = scale * (centres @ transform[:, :3].T + transform[:, 3])
+    np.testing.assert_allclose(outputs.cameras.camera_to_worlds[:, :, 3], expected, atol=1e-6)
+    np.testing.assert_allclose(transform[:, :3] @ transform[:, :3].T, np.eye(3), atol=1e-6)
+
+
+@pytest.mark.parametrize("held_out_every", [2, 3])
+def test_splits_share_no_frame_and_leave_none_out(tmp_path: Path, held_out_every: int):
+    folder = write_esim(tmp_path / "esim")
+    times = {
+        split: parse(folder, split, held_out_every=held_out_every).metadata["frames"].times.tolist()
+        for split in ("train", "val", "test")
+    }
+    assert times["val"] == times["test"]
+    assert sorted(times["train"] + times["test"]) == FRAME_TIMES.tolist()
+    assert len(times["test"]) == 1
+
+
+@pytest.mark.parametrize("choice", ["blurred", "sharp"])
+def test_training_frames_are_blurred_by_default_and_evaluation_is_always_on_sharp_ones(tmp_path: Path, choice):
+    folder = write_esim(tmp_path / "esim", frames=("images", "images_corrupted"))
+    train = parse(folder, train_frames=choice)
+    assert {file.parent.name for file in train.image_filenames} == {
+        "blurred": {"images_corrupted"},
+        "sharp": {"images"},
+    }[choice]
+    assert {file.parent.name for file in parse(folder, "test").image_filenames} == {"images"}
+
+
+def test_a_recording_without_frames_has_cameras_along_its_trajectory_with_pictures_of_events(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim", frames=())
+    outputs = {split: parse(folder, split) for split in ("train", "test")}
+    for parsed in outputs.values():
+        assert len({file.parent for file in parsed.image_filenames}) == 1 and len(parsed.image_filenames) > 1
+        assert len(parsed.cameras) == len(parsed.image_filenames)
+    assert not set(outputs["train"].image_filenames) & set(outputs["test"].image_filenames)
+
+    dataset = EventDataset(outputs["train"])
+    times = outputs["train"].metadata["frames"].times
+    late = int(np.flatnonzero(times > EVENTS[-1, 2])[0])
+    picture = dataset[late]["image"]
+    assert picture.shape == (18, 24, 3)
+    drawn = {(x, y): p for x, y, _, p in EVENTS.tolist()}  # the latest event of a pixel is what is seen
+    for row, column in np.ndindex(18, 24):
+        red, _, blue = picture[row, column].tolist()
+        assert np.sign(red - blue) == drawn.get((column, row), 0)
+    assert (dataset[0]["image"] == 1).all(), "no event lies before this picture"
+
+
+def test_frames_are_undistorted_colour_pictures_with_depth_where_there_is(tmp_path: Path):
+    davis = write_davis(tmp_path / "davis")
+    picture = EventDataset(parse(davis)).get_numpy_image(0)
+    recorded = cv2.imread(str(davis / "images/frame_00000000.png"))
+    matrix, distortion = np.array([[330.0, 0, 11.5], [0, 340, 8.5], [0, 0, 1]]), np.array([-0.14, 0.09, -0.0003, 0.0002])
+    new, _ = cv2.getOptimalNewCameraMatrix(matrix, distortion, (24, 18), 0.0)
+    np.testing.assert_array_equal(picture, cv2.undistort(recorded, matrix, distortion, newCameraMatrix=new))
+
+    esim = write_esim(tmp_path / "esim", channels=1, depth=True)
+    data = EventDataset(parse(esim, "test"))[0]
+    assert data["image"].shape == (18, 24, 3) and data["depth"].shape == (18, 24, 1)
+    assert (data["depth"] == 3.0).all()  # the third frame is held out
+    assert "depth" not in EventDataset(parse(davis))[0]
+
+
+@pytest.mark.parametrize(("config", "write"), [(EsimDataParserConfig, write_esim), (DavisDataParserConfig, write_davis)])
+def test_a_named_format_reads_its_folders_and_no_others(tmp_path: Path, config, write):
+    folder = write(tmp_path / "recording")
+    parser = config(data=folder, depth_range=(NEAR, FAR)).setup()
+    assert len(parser.get_dataparser_outputs("train").image_filenames) == 2
+    other = (write_davis if write is write_esim else write_esim)(tmp_path / "other")
+    with pytest.raises(SystemExit, match=str(other)):
+        config(data=other, depth_range=(NEAR, FAR)).setup().get_dataparser_outputs("train")
+
+
+def test_depth_that_cannot_be_measured_is_an_error_of_one_sentence_that_names_the_flag(tmp_path: Path):
+    parser = EventDataParserConfig(data=write_davis(tmp_path / "davis")).setup()
+    with pytest.raises(RecordingError, match=r"davis.*depth-range") as error:
+        parser.outputs(parser.recording(), "train")
+    assert "\n" not in str(error.value)
+    with pytest.raises(SystemExit, match="depth-range"):
+        parser.get_dataparser_outputs("train")

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from enerf_ns.losses import event_loss, frame_loss, no_event_loss, normalised_event_loss
+
+PREDICTED = torch.tensor([0.5, -0.25, 0.0])
+MEASURED = torch.tensor([0.25, -0.5, 0.5])
+
+
+def test_event_loss_is_the_squared_error_in_thresholds():
+    assert event_loss(PREDICTED, MEASURED, 0.25).item() == pytest.approx((1 + 1 + 4) / 3)
+    assert event_loss(MEASURED, MEASURED, 0.25).item() == 0.0
+
+
+def test_event_loss_does_not_depend_on_the_unit_of_brightness():
+    loss = event_loss(PREDICTED, MEASURED, 0.25)
+    torch.testing.assert_close(event_loss(3 * PREDICTED, 3 * MEASURED, 0.75), loss)
+
+
+@pytest.mark.parametrize(
+    ("predicted", "measured", "expected"),
+    [
+        ([3.0, 4.0], [3.0, 4.0], 0.0),
+        ([3.0, 4.0], [-3.0, -4.0], 4.0),
+        ([1.0, 0.0], [0.0, 7.0], 2.0),
+        ([3.0, 4.0], [5.0, 0.0], (0.6 - 1.0) ** 2 + 0.8**2),
+    ],
+)
+def test_normalised_loss_of_unit_vectors(predicted: list[float], measured: list[float], expected: float):
+    loss = normalised_event_loss(torch.tensor(predicted), torch.tensor(measured))
+    assert loss.item() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-2, 7.0, 1e3])
+def test_normalised_loss_does_not_change_with_scale(scale: float):
+    loss = normalised_event_loss(PREDICTED, MEASURED)
+    assert loss.item() > 0.1
+    torch.testing.assert_close(normalised_event_loss(scale * PREDICTED, MEASURED), loss)
+    torch.testing.assert_close(normalised_event_loss(PREDICTED, scale * MEASURED), loss)
+
+
+def test_normalised_loss_of_a_constant_field_has_a_finite_gradient():
+    predicted = torch.zeros(3, requires_grad=True)
+    normalised_event_loss(predicted, MEASURED).backward()
+    assert predicted.grad is not None and predicted.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "margin", "expected"),
+    [
+        (0.2, 1.0, 0.0),  # C_on = 0.2, C_off = 0.4, mean 0.3
+        (0.5, 1.0, 0.3 / 0.3),
+        (-0.4, 1.0, 0.0),
+        (-0.7, 1.0, 0.3 / 0.3),
+        (0.2, 0.5, 0.1 / 0.3),
+        (-0.3, 0.5, 0.1 / 0.3),
+        (0.2, 0.0, 0.2 / 0.3),
+        (-0.3, 0.0, 0.3 / 0.3),
+    ],
+)
+def test_no_event_loss_beyond_the_margin_of_each_polarity(change: float, margin: float, expected: float):
+    assert no_event_loss(torch.tensor([change]), (0.2, 0.4), margin).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_no_event_loss_is_a_mean_over_pairs():
+    assert no_event_loss(torch.tensor([0.5, 0.0]), (0.2, 0.4)).item() == pytest.approx(0.5)
+
+
+def test_frame_loss():
+    predicted, target = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.5, 0.5, 0.5]])
+    assert frame_loss(predicted, target).item() == pytest.approx(0.5 / 3)

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import relu, conv2d, max_pool2d
+from torchmetrics.functional.image.lpips import _LPIPS
+
+from enerf_ns.evaluation.lpips import WEIGHTS_VARIABLE, load_lpips, lpips
+
+
+@pytest.fixture(autouse=True)
+def load_anew():
+    load_lpips.cache_clear()
+    yield
+    load_lpips.cache_clear()
+
+
+@pytest.fixture
+def weights(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, torch.Tensor]:
+    path = shared_data / "lpips" / "alexnet_features.pth"
+    if not path.is_file():
+        pytest.skip(f"no AlexNet weights at {path}")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(path))
+    return torch.load(path, weights_only=True)
+
+
+def noisy(image: torch.Tensor, amount: float) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return (image + amount * torch.randn(image.shape, generator=generator)).clamp(0, 1)
+
+
+IMAGE = torch.rand(64, 80, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_distance_grows_with_noise_from_zero(weights):
+    distances = [lpips(noisy(IMAGE, amount), IMAGE) for amount in (0.0, 0.1, 0.3)]
+    assert distances[0] == 0.0
+    assert 0.0 < distances[1] < distances[2]
+
+
+def test_distance_equals_the_definition_written_out(weights):
+    """Zhang et al., CVPR 2018, equation 1, with AlexNet's five layers and the linear heads that torchmetrics brings."""
+    heads = _LPIPS(net="alex", pnet_rand=True)
+    shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+    scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
+
+    def features(image: torch.Tensor) -> list[torch.Tensor]:
+        x = ((2 * image.movedim(-1, 0)[None] - 1) - shift) / scale
+        layers = []
+        for number, stride, padding, pool in ((0, 4, 2, 0), (3, 1, 2, 1), (6, 1, 1, 1), (8, 1, 1, 0), (10, 1, 1, 0)):
+            x = max_pool2d(x, 3, 2) if pool else x
+            x = relu(conv2d(x, weights[f"{number}.weight"], weights[f"{number}.bias"], stride, padding))
+            layers.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-8))
+        return layers
+
+    distorted = noisy(IMAGE, 0.2)
+    expected = 0.0
+    with torch.no_grad():
+        for i, (one, other) in enumerate(zip(features(distorted), features(IMAGE), strict=True)):
+            head = getattr(heads, f"lin{i}").model[-1].weight
+            expected += conv2d((one - other) ** 2, head).mean().item()
+    assert expected > 0.01
+    assert lpips(distorted, IMAGE) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no weights"])
+def test_without_weights_there_is_no_distance_and_one_line_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, content: bytes | None
+):
+    path = tmp_path / "weights.pth"
+    if content is not None:
+        path.write_bytes(content)
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(path))
+    assert [lpips(IMAGE, IMAGE), lpips(IMAGE, IMAGE)] == [None, None]
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 and WEIGHTS_VARIABLE in lines[0]
+
+
+def test_weights_that_do_not_fit_are_no_distance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    torch.save({"0.weight": torch.zeros(3)}, tmp_path / "weights.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights.pth"))
+    assert lpips(IMAGE, IMAGE) is None

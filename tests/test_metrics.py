@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch import Tensor
+
+from enerf_ns.evaluation.metrics import align_brightness, depth_rmse, image_metrics
+from enerf_ns.event_camera import inverse_linlog, linlog
+
+
+def pictures(count: int, seed: int = 0) -> list[Tensor]:
+    """Pictures of different mean brightness, float64 [12, 16, 3], from 0.05 to 0.75."""
+    random = np.random.default_rng(seed)
+    return [torch.from_numpy(0.05 + 0.2 * i + 0.3 * random.random((12, 16, 3))) for i in range(count)]
+
+
+def test_alignment_recovers_a_known_scale_and_offset_over_several_pictures():
+    rendered = pictures(3)
+    recorded = [inverse_linlog(0.8 * linlog(image) + 0.5) for image in rendered]
+    aligned, (scale, offset) = align_brightness(rendered, recorded)
+    assert scale == pytest.approx(0.8, abs=1e-9) and offset == pytest.approx(0.5, abs=1e-9)
+    for image, truth in zip(aligned, recorded, strict=True):
+        torch.testing.assert_close(image, truth, rtol=0, atol=1e-9)
+
+
+def test_alignment_is_the_least_squares_of_numpy_over_all_pictures_together():
+    rendered, recorded = pictures(3), pictures(3, seed=1)[::-1]
+    x, y = (torch.cat([linlog(image).flatten() for image in images]).numpy() for images in (rendered, recorded))
+    expected = np.linalg.lstsq(np.column_stack([x, np.ones_like(x)]), y, rcond=None)[0]
+    np.testing.assert_allclose(align_brightness(rendered, recorded)[1], expected, rtol=1e-9)
+
+
+def test_alignment_keeps_the_type_of_the_pictures_and_their_range():
+    rendered = [image.float() for image in pictures(2)]
+    recorded = [(4.0 * image).clamp(max=1.0) for image in rendered]
+    aligned, _ = align_brightness(rendered, recorded)
+    assert all(image.dtype == torch.float32 and image.min() >= 0 and image.max() <= 1 for image in aligned)
+
+
+def test_constant_renders_align_to_the_mean_of_the_recorded():
+    recorded = pictures(2)
+    mean = torch.stack([linlog(image) for image in recorded]).mean()
+    aligned, (scale, offset) = align_brightness([torch.full((12, 16, 3), 0.4)] * 2, recorded)
+    assert scale == 0.0 and offset == pytest.approx(mean.item())
+    torch.testing.assert_close(aligned[1], torch.full((12, 16, 3), inverse_linlog(mean).item()))
+
+
+@pytest.mark.parametrize("values", [(0.4, 0.4), (0.4, 0.6), (0.0, 1.0)])
+def test_scores_of_constant_pictures_are_numbers(values: tuple[float, float]):
+    scores = image_metrics(*(torch.full((12, 16, 3), value) for value in values))
+    assert all(np.isfinite(score) for score in scores.values())
+    assert scores["correlation"] == 0.0
+    assert scores["psnr"] == pytest.approx(120.0 if values[0] == values[1] else -20 * np.log10(values[1] - values[0]))
+
+
+def test_scores_equal_those_of_scikit_image():
+    random = np.random.default_rng(0)
+    recorded = random.random((40, 50, 3)).astype(np.float32)
+    rendered = (recorded + 0.1 * random.standard_normal(recorded.shape)).clip(0, 1).astype(np.float32)
+    scores = image_metrics(torch.from_numpy(rendered), torch.from_numpy(recorded))
+    assert scores["psnr"] == pytest.approx(peak_signal_noise_ratio(recorded, rendered, data_range=1.0), abs=1e-4)
+    gaussian = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, ssim = structural_similarity(recorded, rendered, data_range=1.0, channel_axis=2, full=True, **gaussian)
+    assert scores["ssim"] == pytest.approx(ssim.mean(), abs=5e-4)  # they mirror the border differently
+    assert scores["correlation"] == pytest.approx(np.corrcoef(rendered.ravel(), recorded.ravel())[0, 1], abs=1e-5)
+
+
+def test_depth_error_leaves_out_what_is_unknown():
+    rendered = torch.tensor([[1.0, 2.0], [3.0, 100.0]])[..., None]
+    recorded = torch.tensor([[2.0, 2.0], [5.0, 0.0]])[..., None]
+    assert depth_rmse(rendered, recorded) == pytest.approx(np.sqrt((1 + 0 + 4) / 3))
