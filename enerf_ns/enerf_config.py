@@ -47,7 +47,7 @@ def allow_numpy_scalars_in_checkpoints() -> None:
 def method_config(
     name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
 ) -> EnerfTrainerConfig:
-    """A trainer whose learning rate falls to a hundredth over the run, on the device that the machine has."""
+    """A trainer whose learning rate falls to a tenth over the run, on the device that the machine has."""
     return EnerfTrainerConfig(
         method_name=name,
         max_num_iterations=iterations,
@@ -61,7 +61,7 @@ def method_config(
         optimizers={
             "fields": {
                 "optimizer": FusedAdamOptimizerConfig(lr=learning_rate, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.01 * learning_rate, max_steps=iterations),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.1 * learning_rate, max_steps=iterations),
             }
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13, quit_on_train_completion=True),
@@ -91,7 +91,11 @@ enerf_paper = MethodSpecification(
         learning_rate=5e-3,
         pipeline=EnerfPipelineConfig(
             datamanager=EnerfDataManagerConfig(
-                event_pairs=30096, pair_mode="successor", uniform_over="pixels", train_num_rays_per_batch=30096
+                event_pairs=30096,
+                pair_mode="successor",
+                uniform_over="pixels",
+                silent_pairs=0,
+                train_num_rays_per_batch=30096,
             ),
             model=EnerfModelConfig(
                 num_levels=16,
@@ -101,8 +105,13 @@ enerf_paper = MethodSpecification(
                 hidden_dim=64,
                 hidden_dim_color=64,
                 view_direction=True,
+                brightness="sigmoid",
                 sampling="uniform",
                 num_samples=512,
+                no_event_loss_weight=1.0,
+                no_event_margin=1.0,
+                frame_loss_weight=1.0,
+                opacity_loss_weight=0.0,
                 distortion_loss_weight=0.0,
                 eval_num_rays_per_chunk=1 << 12,
             ),

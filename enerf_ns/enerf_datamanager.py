@@ -44,13 +44,13 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Pairs of instants with events between them, drawn at each step."""
     pair_mode: Literal["successor", "partner", "window"] = "partner"
     """The other event of a pair: the pixel's next; one of its next few; its last in a window of time."""
-    max_pair_distance: int = 30
+    max_pair_distance: int = 10
     """Events of the pixel that a partner may lie ahead, for pair-mode partner."""
     window_ms: float = 60.0
     """Length of the windows for pair-mode window."""
     uniform_over: Literal["pairs", "pixels"] = "pairs"
     """Draw every pair alike, or every active pixel alike."""
-    silent_pairs: int = 0
+    silent_pairs: int = 341
     """Pairs of instants at a pixel that saw no event between them, drawn at each step."""
     silence_ms: float = 20.0
     """Shortest silence of a pixel that counts."""
@@ -83,18 +83,21 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """Index the events on the device, and what turns pixels and times into rays."""
         config, camera = self.config, recording.camera
         index = EventIndex.from_events(recording.events, camera.width, camera.height).to(self.device)
-        self.pair_sampler = EventPairSampler(
-            index,
-            config.pair_mode,
-            max_distance=config.max_pair_distance,
-            window_ns=round(config.window_ms * 1e6),
-            uniform_over=config.uniform_over,
-        )
         self.silent_sampler = None
-        if config.silent_pairs:
-            events = recording.events
-            silence = round(config.silence_ms * 1e6)
-            self.silent_sampler = SilentPixelSampler(index, int(events.t[0]), int(events.t[-1]), silence, silence)
+        try:
+            self.pair_sampler = EventPairSampler(
+                index,
+                config.pair_mode,
+                max_distance=config.max_pair_distance,
+                window_ns=round(config.window_ms * 1e6),
+                uniform_over=config.uniform_over,
+            )
+            if config.silent_pairs:
+                first, last = recording.events.t[[0, -1]].tolist()
+                silence = round(config.silence_ms * 1e6)
+                self.silent_sampler = SilentPixelSampler(index, first, last, silence, silence)
+        except ValueError as error:
+            raise SystemExit(f"enerf: {recording.path}: {error}") from error
         directions = camera.pixel_directions().reshape(-1, 3)
         norm = np.linalg.norm(directions, axis=-1, keepdims=True)
         self.pixel_directions = torch.from_numpy(directions / norm).float().to(self.device)

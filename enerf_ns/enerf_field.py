@@ -15,6 +15,9 @@ from torch import Tensor, nn
 
 from enerf_ns.encodings.hash_grid import HashGrid
 
+DARKEST = 2.0 / 255.0
+"""Lowest brightness of a field whose sigmoid spans log brightness."""
+
 
 class HashDensity(nn.Module):
     """Density, and features beside it, of a point in a box: hash grid and one hidden layer.
@@ -72,7 +75,9 @@ class EnerfField(Field):
         num_channels: 1 for grey, 3 for colour.
         view_direction: Whether colour depends on the direction from which a point is seen.
         density: Keywords of `HashDensity`.
-        hidden_dim_color: Width of the two hidden layers of the colour network.
+        hidden_dim_color: Width of the hidden layers of the colour network.
+        log_sigmoid: Let a sigmoid span log brightness, from `DARKEST` to 1, so that the field starts in the middle of
+            what the sensor can tell apart; else brightness itself, as in the paper, which starts close to its upper end.
     """
 
     def __init__(
@@ -83,9 +88,11 @@ class EnerfField(Field):
         view_direction: bool,
         hidden_dim_color: int,
         num_features: int,
+        log_sigmoid: bool,
         **density,
     ):
         super().__init__()
+        self.log_sigmoid = log_sigmoid
         self.geometry = HashDensity(aabb, num_features=num_features, **density)
         self.direction_encoding = SHEncoding(levels=4, implementation="torch") if view_direction else None
         directions = self.direction_encoding.get_out_dim() if self.direction_encoding else 0
@@ -95,7 +102,6 @@ class EnerfField(Field):
             layer_width=hidden_dim_color,
             out_dim=num_channels,
             activation=nn.ReLU(),
-            out_activation=nn.Sigmoid(),
             implementation="torch",
         )
 
@@ -111,4 +117,5 @@ class EnerfField(Field):
             directions = get_normalized_directions(ray_samples.frustums.directions)
             encoded = self.direction_encoding(directions.reshape(-1, 3)).view(*directions.shape[:-1], -1)
             inputs = torch.cat([encoded, inputs], dim=-1)
-        return {FieldHeadNames.RGB: self.color_network(inputs)}
+        color = torch.sigmoid(self.color_network(inputs))
+        return {FieldHeadNames.RGB: DARKEST ** (1.0 - color) if self.log_sigmoid else color}

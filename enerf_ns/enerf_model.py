@@ -52,6 +52,8 @@ class EnerfModelConfig(ModelConfig):
     """What the density network tells the colour network."""
     view_direction: bool = False
     """Let colour depend on the viewing direction: for shiny scenes that are seen from many sides."""
+    brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
+    """What the colour network's output spans evenly: log brightness, or brightness as in the paper."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour frames, else 1."""
     sampling: Literal["proposal", "uniform"] = "proposal"
@@ -66,12 +68,14 @@ class EnerfModelConfig(ModelConfig):
     """Compare changes of brightness in units of the threshold, or only up to scale."""
     event_loss_weight: float = 1.0
     """Weight of the event loss."""
-    no_event_loss_weight: float = 1.0
+    no_event_loss_weight: float = 0.1
     """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
-    no_event_margin: float = 1.0
+    no_event_margin: float = 0.0
     """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
     frame_loss_weight: float = 100.0
     """Weight of the loss on frames."""
+    opacity_loss_weight: float = 1.0
+    """Weight of the share of each ray that no surface stops. 0 for objects in front of nothing."""
     distortion_loss_weight: float = 0.01
     """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
     interlevel_loss_weight: float = 1.0
@@ -112,6 +116,7 @@ class EnerfModel(Model):
             num_channels=config.num_channels,
             view_direction=config.view_direction,
             hidden_dim_color=config.hidden_dim_color,
+            log_sigmoid=config.brightness == "log-sigmoid",
             num_features=config.num_features,
             num_levels=config.num_levels,
             min_res=config.base_res,
@@ -176,13 +181,11 @@ class EnerfModel(Model):
             field_outputs = self.field(samples)
             weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
             accumulation = self.renderer_accumulation(weights=weights)
-            rays = accumulation.shape[0]
-            background = (
-                torch.rand((rays, 1), device=accumulation.device)
-                if self.training
-                else torch.full((rays, 1), 0.0, device=accumulation.device)
-            )
-        color = torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + (1.0 - accumulation) * background
+            rgb = field_outputs[FieldHeadNames.RGB]
+            background = torch.zeros_like(accumulation)
+            if self.training:
+                background = torch.rand((len(background), 1), device=background.device)
+        color = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
         outputs = {"rgb": color.expand(-1, 3), "accumulation": accumulation}
         with torch.no_grad():
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
@@ -228,6 +231,8 @@ class EnerfModel(Model):
             losses["frame_loss"] = config.frame_loss_weight * self.frame_error(outputs, batch)
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
+            if config.opacity_loss_weight:
+                losses["opacity_loss"] = config.opacity_loss_weight * (1.0 - outputs["accumulation"]).mean()
             if config.distortion_loss_weight:
                 losses["distortion_loss"] = config.distortion_loss_weight * distortion_loss(weights, samples)
             if self.proposal is not None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
-from enerf_ns.evaluation.metrics import align_brightness, depth_rmse, image_metrics
+from enerf_ns.evaluation.metrics import align_brightness, correlation, depth_rmse, image_metrics
 
 
 @dataclass
@@ -38,6 +38,8 @@ class HeldOutView:
     """Frame in [0, 1], three channels."""
     rendered: Tensor
     """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
+    unaligned: Tensor
+    """Render before its brightness was aligned."""
     depth: Tensor
     """Rendered depth in metres along the optical axis, one channel."""
     recorded_depth: Tensor | None
@@ -78,6 +80,7 @@ class EnerfPipeline(VanillaPipeline):
                 HeldOutView(
                     recorded=data["image"][..., :3],
                     rendered=outputs["rgb"].cpu(),
+                    unaligned=outputs["rgb"].cpu(),
                     depth=z_depth.cpu(),
                     recorded_depth=data.get("depth"),
                     time=int(dataset.frames.times[index]),
@@ -126,8 +129,9 @@ class EnerfPipeline(VanillaPipeline):
 
 
 def view_scores(view: HeldOutView) -> dict[str, float]:
-    """Scores of one held-out frame."""
+    """Scores of one held-out frame. The correlation is that of the render as it is, before brightness is aligned."""
     scores = image_metrics(view.rendered, view.recorded)
+    scores["correlation"] = correlation(view.unaligned, view.recorded)
     perceptual = lpips(view.rendered, view.recorded)
     if perceptual is not None:
         scores["lpips"] = perceptual

@@ -48,7 +48,6 @@ def event_picture(recording: EventRecording, time: int) -> np.ndarray:
     last = int(np.searchsorted(events.t, time, side="right"))
     first = max(0, last - int(EVENTS_IN_PICTURE * camera.width * camera.height))
     picture = np.full((camera.height, camera.width, 3), 255, dtype=np.uint8)
-    x, y, on = events.x[first:last], events.y[first:last], events.p[first:last] > 0
-    picture[y[on], x[on]] = (205, 50, 50)
-    picture[y[~on], x[~on]] = (50, 70, 205)
+    on = events.p[first:last, None] > 0
+    picture[events.y[first:last], events.x[first:last]] = np.where(on, (205, 50, 50), (50, 70, 205))
     return camera.undistort(picture)

@@ -39,14 +39,21 @@ def align_brightness(
 def image_metrics(
     rendered: Float[Tensor, "height width channels"], recorded: Float[Tensor, "height width channels"]
 ) -> dict[str, float]:
-    """PSNR in dB, SSIM and linear correlation of two pictures in [0, 1]."""
+    """PSNR in dB and SSIM of two pictures in [0, 1]."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     psnr = -10.0 * torch.log10(torch.mean((rendered - recorded) ** 2).clamp(min=1e-12))
     pictures = [image.movedim(-1, 0)[None] for image in (rendered, recorded)]
     ssim = structural_similarity_index_measure(pictures[0], pictures[1], data_range=1.0)
-    correlation = torch.corrcoef(torch.stack([rendered.flatten(), recorded.flatten()]).double())[0, 1].nan_to_num()
-    return {"psnr": float(psnr), "ssim": float(ssim), "correlation": float(correlation)}
+    return {"psnr": float(psnr), "ssim": float(ssim)}
+
+
+def correlation(
+    rendered: Float[Tensor, "height width channels"], recorded: Float[Tensor, "height width channels"]
+) -> float:
+    """Linear (Pearson) correlation of two pictures, which no scale and offset of brightness changes; 0 if one is flat."""
+    pixels = torch.stack([rendered.flatten(), recorded.flatten()]).double()
+    return float(torch.corrcoef(pixels)[0, 1].nan_to_num())
 
 
 def depth_rmse(rendered: Float[Tensor, "height width 1"], recorded: Float[Tensor, "height width 1"]) -> float:

@@ -1,0 +1,62 @@
+"""How much of a training step goes into drawing pairs and posing their rays.
+
+    python benchmarks/training_step.py RECORDING
+
+Prints a Markdown table: median milliseconds of `next_train` and of the whole step of the method `enerf`.
+"""
+
+from __future__ import annotations
+
+import copy
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+
+@dataclass
+class TrainingStep:
+    """Time sampling and posing against whole training steps."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Folder of the recording."""
+    event_pairs: tuple[int, ...] = (1024, 30096)
+    """Batch sizes."""
+    repeats: int = 7
+    """Steps timed for each."""
+
+    def main(self) -> None:
+        from nerfstudio.configs.method_configs import all_methods
+
+        print("| event pairs | sample and pose, ms | whole step, ms | share |\n|---|---|---|---|")
+        for pairs in self.event_pairs:
+            with tempfile.TemporaryDirectory() as folder:
+                config = copy.deepcopy(all_methods["enerf"])
+                config.data, config.output_dir, config.vis = self.data, Path(folder), "tensorboard"
+                config.pipeline.datamanager.event_pairs = pairs
+                trainer = config.setup()
+                trainer.setup()
+                sampling = self.median_ms(lambda trainer=trainer: trainer.pipeline.datamanager.next_train(0))
+                step = self.median_ms(lambda trainer=trainer: trainer.train_iteration(0))
+            print(f"| {pairs} | {sampling:.1f} | {step:.0f} | {100 * sampling / step:.1f} % |", flush=True)
+
+    def median_ms(self, call: Callable) -> float:
+        """Median wall time of a call, after two that warm up."""
+        times = []
+        for _ in range(self.repeats + 2):
+            start = time.perf_counter()
+            call()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            times.append(time.perf_counter() - start)
+        return 1e3 * statistics.median(times[2:])
+
+
+if __name__ == "__main__":
+    tyro.cli(TrainingStep).main()

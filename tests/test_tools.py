@@ -1,0 +1,329 @@
+"""Every ns-* tool on a tiny run that `ns-train` made, called from another working directory.
+
+The tools that only differ in what they do with a loaded run are called in this process, by their own entry points and
+with command lines as a person types them: starting each anew would cost ten seconds of imports.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import importlib
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+
+from enerf_ns.scripts.simulate import Simulate
+
+pytestmark = pytest.mark.slow
+
+WIDTH, HEIGHT, NUM_FRAMES, NUM_HELD_OUT = 32, 24, 11, 3
+SMALL = [
+    *("--vis", "tensorboard", "--max-num-iterations", "5", "--machine.device-type", "cpu"),
+    *("--pipeline.datamanager.event-pairs", "64", "--pipeline.model.log2-table-size", "12"),
+]
+ENTRY_POINTS = {
+    "ns-train": "nerfstudio.scripts.train",
+    "ns-eval": "nerfstudio.scripts.eval",
+    "ns-render": "nerfstudio.scripts.render",
+    "ns-export": "nerfstudio.scripts.exporter",
+    "enerf": "enerf_ns.scripts.cli",
+}
+
+
+def start(tool: str, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own."""
+    command = [Path(sys.executable).with_name(tool), *map(str, arguments)]
+    environment = {**os.environ, "COLUMNS": "200", "ENERF_LPIPS_WEIGHTS": str(cwd / "no-weights")}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture
+def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Calls a tool in this process, in an empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ENERF_LPIPS_WEIGHTS", str(tmp_path / "no-weights"))
+
+    def call_tool(tool: str, *arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", [tool, *map(str, arguments)])
+        importlib.import_module(ENTRY_POINTS[tool]).entrypoint()
+
+    return call_tool
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the recordings and the runs lie: `recording`, and the same `without_frames`."""
+    home = tmp_path_factory.mktemp("home")
+    Simulate("shapes", home / "recording", width=WIDTH, height=HEIGHT, duration=0.1, exposure_ms=5.0,
+             num_frames=NUM_FRAMES).main()  # fmt: skip
+    without = shutil.ignore_patterns("images*", "depth")
+    shutil.copytree(home / "recording", home / "without_frames", ignore=without)
+    return home
+
+
+def make_opaque(config: Path) -> Path:
+    """Raises the density of a run: a few steps make no surface, and `ns-export pointcloud` waits for one."""
+    (file,) = (config.parent / "nerfstudio_models").glob("step-*.ckpt")
+    checkpoint = torch.load(file)
+    checkpoint["pipeline"]["_model.field.geometry.network.layers.1.bias"][0] += 8.0
+    torch.save(checkpoint, file)
+    return config
+
+
+@pytest.fixture(scope="module")
+def run(home: Path) -> Path:
+    """config.yml of a run that `ns-train enerf --data DIR` made, DIR a relative path."""
+    before = contents(home / "recording")
+    trained = start("ns-train", "enerf", "--data", "recording", *SMALL, cwd=home)
+    assert trained.returncode == 0, trained.stdout + trained.stderr
+    for line in ("Recording", "Parts of the method", "Training is done"):
+        assert line in trained.stdout
+    (config,) = (home / "outputs/recording/enerf").glob("*/config.yml")
+    assert contents(home / "recording") == before
+    return make_opaque(config)
+
+
+@pytest.fixture(scope="module")
+def run_without_frames(home: Path) -> Path:
+    """The same of a recording without frames, through the subcommand of its format."""
+    data = home / "without_frames"
+    trained = start("ns-train", "enerf", *SMALL, "esim-events", "--data", data, "--held-out-every", 16, cwd=home)
+    assert trained.returncode == 0, trained.stdout + trained.stderr
+    (config,) = (home / "outputs/without_frames/enerf").glob("*/config.yml")
+    return make_opaque(config)
+
+
+def contents(folder: Path) -> dict[Path, str]:
+    """Hashes of all files of a folder."""
+    return {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.rglob("*") if file.is_file()}
+
+
+def check_video(path: Path, frames: int, columns: int = 1) -> None:
+    """A video of pictures side by side that can be decoded, and is not the same all over."""
+    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == frames
+    reader = imageio_ffmpeg.read_frames(str(path))
+    assert next(reader)["source_size"] == (columns * WIDTH, HEIGHT)  # type: ignore[index]
+    assert np.frombuffer(next(reader), np.uint8).std() > 0
+    reader.close()
+
+
+def test_eval(run: Path, tmp_path: Path):
+    scored = start("ns-eval", "--load-config", run, "--output-path", "scores.json",
+                   "--render-output-path", "pictures", cwd=tmp_path)  # fmt: skip
+    assert scored.returncode == 0, scored.stdout + scored.stderr
+    scores = json.loads((tmp_path / "scores.json").read_text())["results"]
+    assert scores["psnr"] > 5 and -1 <= scores["ssim"] <= 1 and 0 < scores["depth_rmse"] < 10
+    assert "lpips" not in scores and "LPIPS is left out" in scored.stdout
+    pictures = sorted((tmp_path / "pictures").iterdir())
+    assert len(pictures) == NUM_HELD_OUT and Image.open(pictures[0]).size == (2 * WIDTH, HEIGHT)
+
+
+def test_render_interpolate_finds_ffmpeg(run: Path, tmp_path: Path):
+    rendered = start("ns-render", "interpolate", "--load-config", run, "--output-path", "video.mp4",
+                     "--interpolation-steps", 3, "--rendered-output-names", "rgb", "depth", "accumulation", "normals",
+                     cwd=tmp_path)  # fmt: skip
+    assert rendered.returncode == 0, rendered.stdout + rendered.stderr
+    check_video(tmp_path / "video.mp4", frames=3 * (NUM_HELD_OUT - 1), columns=4)
+
+
+def test_render_spiral(call, run: Path):
+    call("ns-render", "spiral", "--load-config", run, "--output-path", "video.mp4", "--seconds", 0.5)
+    check_video(Path("video.mp4"), frames=12)
+
+
+def test_render_camera_path(call, run: Path):
+    """The file that the viewer writes."""
+    pose = eval_setup(run)[1].datamanager.eval_dataset.cameras.camera_to_worlds[0]
+    path = []
+    for shift in np.linspace(0.0, 0.2, 5):
+        matrix = np.vstack([pose, [0, 0, 0, 1]])
+        matrix[0, 3] += shift
+        path.append({"camera_to_world": matrix.ravel().tolist(), "fov": 60.0, "aspect": WIDTH / HEIGHT})
+    camera_path = {
+        "camera_type": "perspective",
+        "render_height": HEIGHT,
+        "render_width": WIDTH,
+        "fps": 10,
+        "seconds": 0.5,
+        "smoothness_value": 0.5,
+        "is_cycle": False,
+        "crop": None,
+        "camera_path": path,
+    }
+    Path("path.json").write_text(json.dumps(camera_path))
+    call("ns-render", "camera-path", "--load-config", run, "--camera-path-filename", "path.json",
+         "--output-path", "video.mp4")  # fmt: skip
+    check_video(Path("video.mp4"), frames=5)
+
+
+def test_render_dataset(call, run: Path):
+    call("ns-render", "dataset", "--load-config", run, "--output-path", "renders", "--split", "train+test",
+         "--image-format", "png", "--rendered-output-names", "rgb", "gt-rgb", "depth", "raw-depth")  # fmt: skip
+    for split, count in {"train": NUM_FRAMES - NUM_HELD_OUT, "test": NUM_HELD_OUT}.items():
+        for output, suffix in {"rgb": ".png", "gt-rgb": ".png", "depth": ".png", "raw-depth": ".npy.gz"}.items():
+            assert len(list(Path("renders", split, output).glob(f"*{suffix}"))) == count
+    frame = np.asarray(Image.open("renders/test/gt-rgb/00002.png"))
+    recording = yaml.load(run.read_text(), Loader=yaml.Loader).data
+    np.testing.assert_array_equal(frame, Image.open(recording / "images/00002.png"))
+    with gzip.open("renders/test/raw-depth/00002.npy.gz") as file:
+        assert (np.load(file) > 0).all()
+
+
+def test_export_point_cloud(call, run: Path):
+    open3d = pytest.importorskip("open3d", reason="open3d lacks system libraries", exc_type=ImportError)
+    call("ns-export", "pointcloud", "--load-config", run, "--output-dir", "cloud", "--num-points", 500,
+         "--num-rays-per-batch", 512, "--remove-outliers", "False", "--save-world-frame", "True")  # fmt: skip
+    cloud = open3d.io.read_point_cloud("cloud/point_cloud.ply")
+    assert len(cloud.points) == 512
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-3)
+    config, pipeline, _, _ = eval_setup(run)
+    recording = pipeline.datamanager.train_dataset.recording
+    distances = np.linalg.norm(np.asarray(cloud.points) - recording.trajectory.positions.mean(axis=0), axis=1)
+    near, far = config.pipeline.datamanager.dataparser.depth_range
+    assert 0.8 * near < distances.min() and distances.max() < 1.5 * far, "the points lie in the scene, in metres"
+
+
+def test_export_tsdf(call, run: Path):
+    pytest.importorskip("open3d", reason="open3d lacks system libraries", exc_type=ImportError)
+    call("ns-export", "tsdf", "--load-config", run, "--output-dir", "mesh", "--resolution", 32, "--downscale-factor", 1,
+         "--num-pixels-per-side", 256, "--target-num-faces", 500)  # fmt: skip
+    assert Path("mesh/mesh.obj").read_text().count("\nf ") > 10
+    assert Image.open("mesh/material_0.png").size == (256, 256)
+
+
+def test_export_cameras(call, run: Path):
+    pytest.importorskip("open3d", reason="open3d lacks system libraries", exc_type=ImportError)
+    call("ns-export", "cameras", "--load-config", run, "--output-dir", "cameras")
+    cameras = [json.loads(Path(f"cameras/transforms_{split}.json").read_text()) for split in ("train", "eval")]
+    assert [len(split) for split in cameras] == [NUM_FRAMES - NUM_HELD_OUT, NUM_HELD_OUT]
+    assert all(Path(camera["file_path"]).is_file() for split in cameras for camera in split)
+
+
+def test_report(call, run: Path):
+    call("enerf", "report", run, "--output-dir", "report")
+    scores = json.loads(Path("report/scores.json").read_text())
+    assert scores["lpips"] is None and scores["psnr"] > 5 and 0 < scores["depth_rmse"] and 1 < scores["mean_depth"] < 4
+    assert Image.open("report/side-by-side.png").size[0] > 1000
+    check_video(Path("report/video.mp4"), frames=6 * (NUM_HELD_OUT - 1), columns=2)
+
+
+def test_report_of_no_run_is_an_error(call):
+    with pytest.raises(SystemExit, match=r"enerf: .*nothing\.yml"):
+        call("enerf", "report", "nothing.yml")
+
+
+def test_resume(call, run: Path, tmp_path: Path):
+    """Training goes on from the checkpoint with its parameters, its optimizer and its step."""
+    checkpoints = run.parent / "nerfstudio_models"
+    recording = yaml.load(run.read_text(), Loader=yaml.Loader).data
+    call("ns-train", "enerf", "--data", recording, *SMALL, "--load-dir", checkpoints, "--timestamp", "resumed")
+    (file,) = tmp_path.glob("outputs/recording/enerf/resumed/nerfstudio_models/*.ckpt")
+    before, after = (torch.load(path) for path in (checkpoints / "step-000000004.ckpt", file))
+    assert (before["step"], after["step"]) == (4, 9)
+    (state,) = {int(state["step"]) for state in after["optimizers"]["fields"]["state"].values()}
+    assert state == 10
+    bias = "_model.field.geometry.network.layers.1.bias"
+    assert abs(after["pipeline"][bias][0] - before["pipeline"][bias][0]) < 0.5, "it starts from the raised density"
+
+
+def test_the_viewer_answers(run: Path, tmp_path: Path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [Path(sys.executable).with_name("ns-viewer"), "--load-config", run, "--viewer.websocket-port", str(port)]
+    with open(tmp_path / "log", "w") as log:
+        viewer = subprocess.Popen(command, cwd=tmp_path, stdout=log, stderr=log)
+    try:
+        page = ""
+        for _ in range(120):
+            assert viewer.poll() is None, (tmp_path / "log").read_text()
+            try:
+                page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5).read().decode()
+                break
+            except (urllib.error.URLError, ConnectionError):
+                time.sleep(0.5)
+        assert "<html" in page.lower()
+        time.sleep(1.0)
+        assert viewer.poll() is None, (tmp_path / "log").read_text()
+    finally:
+        viewer.terminate()
+        viewer.wait()
+
+
+def test_eval_without_frames(call, run_without_frames: Path):
+    call("ns-eval", "--load-config", run_without_frames, "--output-path", "scores.json")
+    scores = json.loads(Path("scores.json").read_text())["results"]
+    assert np.isfinite(scores["psnr"]) and "depth_rmse" not in scores
+
+
+def test_render_without_frames(call, run_without_frames: Path):
+    call("ns-render", "interpolate", "--load-config", run_without_frames, "--output-path", "video.mp4",
+         "--interpolation-steps", 3)  # fmt: skip
+    check_video(Path("video.mp4"), frames=6)
+    call("ns-render", "dataset", "--load-config", run_without_frames, "--output-path", "renders",
+         "--rendered-output-names", "rgb", "gt-rgb")  # fmt: skip
+    pictures = sorted(Path("renders/test/gt-rgb").iterdir())
+    assert len(pictures) == 3
+    assert np.ptp(np.asarray(Image.open(pictures[-1]))) > 100, "a picture of events"
+
+
+def test_export_without_frames(call, run_without_frames: Path):
+    pytest.importorskip("open3d", reason="open3d lacks system libraries", exc_type=ImportError)
+    call("ns-export", "cameras", "--load-config", run_without_frames, "--output-dir", "cameras")
+    assert len(json.loads(Path("cameras/transforms_train.json").read_text())) == 45
+    call("ns-export", "pointcloud", "--load-config", run_without_frames, "--output-dir", "cloud", "--num-points", 500,
+         "--num-rays-per-batch", 512, "--remove-outliers", "False")  # fmt: skip
+    assert Path("cloud/point_cloud.ply").stat().st_size > 500
+
+
+def check_refused(refused: subprocess.CompletedProcess[str]) -> str:
+    """Not zero, one sentence, no traceback; the sentence."""
+    assert refused.returncode not in (0, None)
+    assert "Traceback" not in refused.stdout + refused.stderr
+    (sentence,) = [line for line in refused.stderr.splitlines() if line.startswith("enerf: ")]
+    return sentence
+
+
+def test_a_bad_recording_is_refused_before_anything_is_written(home: Path, tmp_path: Path):
+    bad = tmp_path / "data" / "bad"
+    shutil.copytree(home / "recording", bad)
+    events = np.load(bad / "events/00000.npy")
+    events[0, 0] = WIDTH
+    np.save(bad / "events/00000.npy", events)
+    before = contents(tmp_path)
+    refused = start("ns-train", "enerf", "--data", "data/bad", *SMALL, cwd=tmp_path)
+    sentence = check_refused(refused)
+    assert "bad/events/00000.npy" in sentence and f"x = {WIDTH}" in sentence
+    assert contents(tmp_path) == before and [entry.name for entry in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--data is missing"),
+        (["--data", "nothing"], "nothing does not exist"),
+        (["--data", "."], "no known format"),
+    ],
+)
+def test_data_that_is_no_recording_is_refused(call, tmp_path: Path, arguments: list[str], message: str):
+    with pytest.raises(SystemExit) as refused:
+        call("ns-train", "enerf", *SMALL, *arguments)
+    assert str(refused.value).startswith("enerf: ") and message in str(refused.value)
+    assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
