@@ -106,6 +106,7 @@ enerf_paper = MethodSpecification(
                 hidden_dim_color=64,
                 view_direction=True,
                 brightness="sigmoid",
+                event_loss="squared",
                 sampling="uniform",
                 num_samples=512,
                 no_event_loss_weight=1.0,

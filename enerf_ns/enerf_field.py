@@ -77,7 +77,7 @@ class EnerfField(Field):
         density: Keywords of `HashDensity`.
         hidden_dim_color: Width of the hidden layers of the colour network.
         log_sigmoid: Let a sigmoid span log brightness, from `DARKEST` to 1, so that the field starts in the middle of
-            what the sensor can tell apart; else brightness itself, as in the paper, which starts close to its upper end.
+            what the sensor can tell apart; else brightness itself, as in the paper, which starts near its upper end.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ from torch.nn import Parameter
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, image_metrics
 from enerf_ns.event_camera import linlog, luma, measured_change
-from enerf_ns.losses import event_loss, frame_loss, no_event_loss, normalised_event_loss
+from enerf_ns.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 from enerf_ns.ray_samplers import SharedJitter
 
 
@@ -64,8 +64,8 @@ class EnerfModelConfig(ModelConfig):
     """Samples of the field along a ray."""
     contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """C_on and C_off. None: the recording's own, else from the counts of both polarities."""
-    event_loss: Literal["threshold", "normalised"] = "threshold"
-    """Compare changes of brightness in units of the threshold, or only up to scale."""
+    event_loss: Literal["huber", "squared", "normalised"] = "huber"
+    """Compare changes of brightness in units of the threshold, robustly or squared as in the paper, or up to scale."""
     event_loss_weight: float = 1.0
     """Weight of the event loss."""
     no_event_loss_weight: float = 0.1
@@ -219,10 +219,11 @@ class EnerfModel(Model):
             predicted, measured, num_events = self.brightness_changes(outputs, batch)
             thresholds = config.contrast_thresholds
             assert thresholds is not None
-            if config.event_loss == "threshold":
-                loss = event_loss(predicted[:num_events], measured, 0.5 * sum(thresholds))
-            else:
+            if config.event_loss == "normalised":
                 loss = normalised_event_loss(predicted[:num_events], measured)
+            else:
+                distance = huber_event_loss if config.event_loss == "huber" else event_loss
+                loss = distance(predicted[:num_events], measured, 0.5 * sum(thresholds))
             losses["event_loss"] = config.event_loss_weight * loss
             if num_events < num_pairs:
                 loss = no_event_loss(predicted[num_events:], thresholds, config.no_event_margin)

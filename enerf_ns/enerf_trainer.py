@@ -32,8 +32,10 @@ class EnerfTrainerConfig(TrainerConfig):
         """
         manager = self.pipeline.datamanager
         if self.data is None:
-            self.data = manager.data or manager.dataparser.data
-        if self.data == Path():
+            self.data = manager.data
+        if self.data is None and manager.dataparser.data != Path():
+            self.data = manager.dataparser.data
+        if self.data is None:
             raise RecordingError("--data is missing; give the folder of a recording")
         self.data = manager.data = manager.dataparser.data = absolute(self.data)
         self.output_dir = absolute(self.output_dir)

@@ -23,6 +23,18 @@ def event_loss(
     return torch.mean(((predicted - measured) / mean_threshold) ** 2)
 
 
+def huber_event_loss(
+    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
+) -> Float[Tensor, ""]:
+    """As `event_loss`, but linear beyond one threshold, so that pairs with wrong or missing events count less.
+
+    Twice the Huber loss with delta 1 of the error in units of the mean threshold (the loss of Deblur e-NeRF, Low and
+    Lee, ECCV 2024): equal to the squared error below one threshold.
+    """
+    error = (predicted - measured) / mean_threshold
+    return 2.0 * torch.nn.functional.huber_loss(error, torch.zeros_like(error))
+
+
 def normalised_event_loss(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], eps: float = 1e-9
 ) -> Float[Tensor, ""]:

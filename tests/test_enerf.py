@@ -6,18 +6,20 @@ import copy
 import json
 import shutil
 from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from enerf_ns.dataparsers.recording import load_image
 from enerf_ns.enerf_config import enerf, enerf_paper
+from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.event_camera import luma
 from enerf_ns.scripts.simulate import Simulate
@@ -43,15 +45,18 @@ def colour_recording(recording: Path) -> Path:
     return folder
 
 
-def small_config(data: Path, output_dir: Path, method=enerf, **changes) -> EnerfTrainerConfig:
-    """The registered method with a small batch and a small field, and changes such as `model__num_samples=8`."""
+def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> EnerfTrainerConfig:
+    """A registered method with a small batch, a small field and few losses, and changes like `model__num_samples=8`."""
     config = copy.deepcopy(method.config)
+    assert isinstance(config, EnerfTrainerConfig)
     config.data, config.output_dir = data, output_dir
     config.vis, config.timestamp = "tensorboard", "run"
     config.machine.device_type = "cpu"
     config.max_num_iterations = 2
     manager, model = config.pipeline.datamanager, config.pipeline.model
     manager.event_pairs = manager.train_num_rays_per_batch = 64
+    manager.silent_pairs, manager.silence_ms = 0, 5.0
+    model.opacity_loss_weight, model.distortion_loss_weight = 0.0, 0.01
     model.log2_table_size, model.num_levels = 12, 4
     model.num_samples = model.num_proposal_samples = 16
     parts = {"data": manager, "model": model}
@@ -62,8 +67,8 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes) -> Enerf
     return config
 
 
-def set_up(config: EnerfTrainerConfig) -> Trainer:
-    """A trainer as `ns-train` makes it."""
+def set_up(config: EnerfTrainerConfig) -> Any:
+    """A trainer as `ns-train` makes it, set up."""
     _set_random_seed(config.machine.seed)
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
@@ -73,36 +78,41 @@ def set_up(config: EnerfTrainerConfig) -> Trainer:
 
 
 EVENTS = {"event_loss", "distortion_loss", "interlevel_loss"}
+SILENT = {"data__silent_pairs": 32}
 
 CONFIGURATIONS = {
-    "default": ({}, EVENTS),
-    "successor": ({"data__pair_mode": "successor"}, EVENTS),
+    "events": ({}, EVENTS),
     "partner": ({"data__pair_mode": "partner", "data__max_pair_distance": 3}, EVENTS),
     "window": ({"data__pair_mode": "window", "data__window_ms": 20.0}, EVENTS),
-    "pairs": ({"data__uniform_over": "pairs"}, EVENTS),
-    "pixels": ({"data__uniform_over": "pixels"}, EVENTS),
     "normalised": ({"model__event_loss": "normalised"}, EVENTS),
-    "silent pixels": ({"data__silent_pairs": 32, "data__silence_ms": 5.0}, {*EVENTS, "no_event_loss"}),
-    "total variation": (
-        {"data__silent_pairs": 32, "data__silence_ms": 5.0, "model__no_event_margin": 0.0},
-        {*EVENTS, "no_event_loss"},
-    ),
-    "no pixel is silent so long": ({"data__silent_pairs": 32, "data__silence_ms": 1e4}, EVENTS),
+    "silent pixels": ({**SILENT, "model__no_event_margin": 1.0}, {*EVENTS, "no_event_loss"}),
+    "total variation": ({**SILENT, "model__no_event_margin": 0.0}, {*EVENTS, "no_event_loss"}),
+    "no pixel is silent so long": ({**SILENT, "data__silence_ms": 1e4}, EVENTS),
     "frames": ({"data__supervision": "frames"}, {"frame_loss", "distortion_loss", "interlevel_loss"}),
     "events and frames": ({"data__supervision": "events+frames"}, {*EVENTS, "frame_loss"}),
-    "all": (
-        {"data__supervision": "events+frames", "data__silent_pairs": 32, "data__silence_ms": 5.0},
-        {*EVENTS, "no_event_loss", "frame_loss"},
+    "all losses": (
+        {"data__supervision": "events+frames", **SILENT, "model__opacity_loss_weight": 1.0},
+        {*EVENTS, "no_event_loss", "frame_loss", "opacity_loss"},
     ),
     "uniform samples": ({"model__sampling": "uniform"}, {"event_loss", "distortion_loss"}),
     "view direction": ({"model__view_direction": True}, EVENTS),
     "colour": ({"model__num_channels": 3}, EVENTS),
     "no distortion loss": ({"model__distortion_loss_weight": 0.0}, {"event_loss", "interlevel_loss"}),
 }
+"""Changes, and the losses that there are then."""
+
+CHOICES = [
+    (f"{part}__{name}", value)
+    for part, config in {"data": EnerfDataManagerConfig, "model": EnerfModelConfig}.items()
+    for name, hint in get_type_hints(config).items()
+    if get_origin(hint) is Literal and name in config.__annotations__
+    for value in get_args(hint)
+]
+"""Every value of every choice that the method has of its own."""
 
 
-def check_two_steps(config: EnerfTrainerConfig, expected_losses: set[str]) -> Trainer:
-    """Every loss is there and finite, and every parameter moves."""
+def check_two_steps(config: EnerfTrainerConfig, expected_losses: set[str]) -> Any:
+    """Every loss is there and finite, and every parameter moves; the trainer."""
     trainer = set_up(config)
     before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.named_parameters()}
     for step in range(2):
@@ -124,11 +134,38 @@ def test_two_steps_of_every_configuration(recording: Path, tmp_path: Path, name:
     check_two_steps(small_config(recording, tmp_path, **changes), losses)
 
 
+@pytest.mark.parametrize(("name", "value"), CHOICES)
+def test_two_steps_with_every_choice(recording: Path, tmp_path: Path, name: str, value: str):
+    """All losses but the frame loss where there is no frame, and but the interlevel loss without proposals."""
+    config = small_config(recording, tmp_path, **{"data__supervision": "events+frames", **SILENT, name: value})
+    losses = {*EVENTS, "frame_loss", "no_event_loss"}
+    without = {
+        "events": {"frame_loss"},
+        "frames": {"event_loss", "no_event_loss"},
+        "uniform": {"interlevel_loss"},
+    }
+    check_two_steps(config, losses - without.get(value, set()))
+
+
+@pytest.mark.parametrize("method", [enerf, enerf_paper])
+def test_two_steps_of_every_method_as_it_is_registered(recording: Path, tmp_path: Path, method):
+    """Only batch and field are made smaller."""
+    registered = method.config.pipeline
+    losses = {
+        "data__silent_pairs": min(registered.datamanager.silent_pairs, 32),
+        "model__opacity_loss_weight": registered.model.opacity_loss_weight,
+        "model__distortion_loss_weight": registered.model.distortion_loss_weight,
+    }
+    trainer = set_up(small_config(recording, tmp_path, method, **losses))
+    for step in range(2):
+        assert trainer.train_iteration(step)[0].isfinite()
+
+
 @pytest.mark.parametrize(("supervision", "frame_loss"), [("events", set()), ("events+frames", {"frame_loss"})])
 def test_two_steps_of_the_setting_of_the_paper(recording: Path, tmp_path: Path, supervision: str, frame_loss: set[str]):
     config = small_config(recording, tmp_path, method=enerf_paper, data__supervision=supervision)
     assert config.pipeline.model.sampling == "uniform" and config.pipeline.model.view_direction
-    check_two_steps(config, {"event_loss", *frame_loss})
+    check_two_steps(config, {"event_loss", "distortion_loss", *frame_loss})
 
 
 @pytest.mark.parametrize("supervision", ["events+frames", "frames"])
@@ -162,7 +199,6 @@ def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: P
         tmp_path,
         data__supervision="events+frames",
         data__silent_pairs=10,
-        data__silence_ms=5.0,
         data__train_num_rays_per_batch=20,
     )
     manager = set_up(config).pipeline.datamanager
@@ -203,15 +239,16 @@ def test_training_brings_the_loss_down(recording: Path, tmp_path: Path):
 
 
 @pytest.fixture(scope="module")
-def trained(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+def trained(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two steps and a checkpoint."""
     trainer = set_up(small_config(recording, tmp_path_factory.mktemp("outputs")))
     trainer.train()
     return trainer
 
 
-def test_a_loaded_run_renders_what_the_trained_one_does(trained: Trainer, monkeypatch, tmp_path: Path):
+def test_a_loaded_run_renders_what_the_trained_one_does(trained: Any, monkeypatch, tmp_path: Path):
     monkeypatch.chdir(tmp_path)
+    loaded: Any
     _, loaded, checkpoint, step = eval_setup(trained.base_dir / "config.yml")
     assert step == 1 and checkpoint.name == "step-000000001.ckpt"
     camera = loaded.datamanager.eval_dataset.cameras[:1]
@@ -245,7 +282,7 @@ def add(state: dict) -> None:
 
 @pytest.mark.parametrize("change", [rename, remove, shorten, add])
 @pytest.mark.parametrize("strict", [True, None])
-def test_parameters_that_do_not_fit_are_an_error(trained: Trainer, change, strict: bool | None):
+def test_parameters_that_do_not_fit_are_an_error(trained: Any, change, strict: bool | None):
     """Nerfstudio asks for a strict load first, and then silently for one that is not."""
     state = trained.pipeline.state_dict()
     change(state)
@@ -253,7 +290,7 @@ def test_parameters_that_do_not_fit_are_an_error(trained: Trainer, change, stric
         trained.pipeline.load_state_dict(state, strict=strict)
 
 
-def test_loading_a_checkpoint_that_does_not_fit_is_an_error(trained: Trainer, tmp_path: Path):
+def test_loading_a_checkpoint_that_does_not_fit_is_an_error(trained: Any, tmp_path: Path):
     run = tmp_path / "outputs/recording/enerf/run"
     shutil.copytree(trained.base_dir, run)
     config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
@@ -301,6 +338,7 @@ def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
 
 def test_the_registered_method_is_left_as_it_was(recording: Path, tmp_path: Path):
     small_config(recording, tmp_path).prepare()
+    assert isinstance(enerf.config, EnerfTrainerConfig)
     assert enerf.config.data is None and enerf.config.pipeline.model.contrast_thresholds is None
 
 

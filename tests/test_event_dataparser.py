@@ -44,7 +44,7 @@ def world_to_camera(time: int) -> tuple[np.ndarray, np.ndarray]:
 def project(point: np.ndarray, time: int, camera: Camera) -> np.ndarray:
     """Pixel (x, y), integer at pixel centres, where a camera sees a point of the world; by OpenCV."""
     rotation, translation = world_to_camera(time)
-    distortion = np.array(camera.distortion) if camera.distortion else None
+    distortion = np.array(camera.distortion or [0.0] * 4)
     return cv2.projectPoints(point[None], rotation, translation, camera.matrix, distortion)[0][0, 0]
 
 
@@ -217,7 +217,10 @@ def test_frames_are_undistorted_colour_pictures_with_depth_where_there_is(tmp_pa
     davis = write_davis(tmp_path / "davis")
     picture = EventDataset(parse(davis)).get_numpy_image(0)
     recorded = cv2.imread(str(davis / "images/frame_00000000.png"))
-    matrix, distortion = np.array([[330.0, 0, 11.5], [0, 340, 8.5], [0, 0, 1]]), np.array([-0.14, 0.09, -0.0003, 0.0002])
+    matrix, distortion = (
+        np.array([[330.0, 0, 11.5], [0, 340, 8.5], [0, 0, 1]]),
+        np.array([-0.14, 0.09, -0.0003, 0.0002]),
+    )
     new, _ = cv2.getOptimalNewCameraMatrix(matrix, distortion, (24, 18), 0.0)
     np.testing.assert_array_equal(picture, cv2.undistort(recorded, matrix, distortion, newCameraMatrix=new))
 
@@ -228,7 +231,9 @@ def test_frames_are_undistorted_colour_pictures_with_depth_where_there_is(tmp_pa
     assert "depth" not in EventDataset(parse(davis))[0]
 
 
-@pytest.mark.parametrize(("config", "write"), [(EsimDataParserConfig, write_esim), (DavisDataParserConfig, write_davis)])
+@pytest.mark.parametrize(
+    ("config", "write"), [(EsimDataParserConfig, write_esim), (DavisDataParserConfig, write_davis)]
+)
 def test_a_named_format_reads_its_folders_and_no_others(tmp_path: Path, config, write):
     folder = write(tmp_path / "recording")
     parser = config(data=folder, depth_range=(NEAR, FAR)).setup()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch.nn.functional import relu, conv2d, max_pool2d
+from torch.nn.functional import conv2d, max_pool2d, relu
 from torchmetrics.functional.image.lpips import _LPIPS
 
 from enerf_ns.evaluation.lpips import WEIGHTS_VARIABLE, load_lpips, lpips
@@ -37,7 +37,7 @@ IMAGE = torch.rand(64, 80, 3, generator=torch.Generator().manual_seed(0))
 def test_distance_grows_with_noise_from_zero(weights):
     distances = [lpips(noisy(IMAGE, amount), IMAGE) for amount in (0.0, 0.1, 0.3)]
     assert distances[0] == 0.0
-    assert 0.0 < distances[1] < distances[2]
+    assert 0.0 < distances[1] < distances[2]  # type: ignore[operator]
 
 
 def test_distance_equals_the_definition_written_out(weights):

@@ -51,7 +51,7 @@ def image_metrics(
 def correlation(
     rendered: Float[Tensor, "height width channels"], recorded: Float[Tensor, "height width channels"]
 ) -> float:
-    """Linear (Pearson) correlation of two pictures, which no scale and offset of brightness changes; 0 if one is flat."""
+    """Linear (Pearson) correlation of two pictures, blind to scale and offset of brightness; 0 if one is flat."""
     pixels = torch.stack([rendered.flatten(), recorded.flatten()]).double()
     return float(torch.corrcoef(pixels)[0, 1].nan_to_num())
 

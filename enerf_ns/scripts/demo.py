@@ -20,6 +20,7 @@ class Demo:
     """Training steps. None: as many as the method enerf takes."""
 
     def main(self) -> None:
+        from nerfstudio.configs.method_configs import all_methods
         from nerfstudio.scripts.train import train_loop
         from nerfstudio.utils.eval_utils import eval_setup
         from nerfstudio.utils.rich_utils import CONSOLE
