@@ -124,7 +124,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """
         self.train_count += 1
         if self.test_mode != "val":
-            return self.frame_rays(self.get_train_rays_per_batch())
+            assert self.train_pixel_sampler is not None
+            return self.frame_rays(self.train_pixel_sampler.num_rays_per_batch)
         bundles: list[RayBundle] = []
         batch: dict = {}
         num_pairs = 0
@@ -139,7 +140,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             num_pairs = len(pixels)
             bundles.append(self.event_rays(pixels.repeat(2), torch.cat([start, end])))
         if self.frame_colors is not None:
-            rays, frame_batch = self.frame_rays(self.get_train_rays_per_batch())
+            rays, frame_batch = self.frame_rays(self.config.train_num_rays_per_batch)
             bundles.append(rays)
             batch |= frame_batch
         batch["num_pairs"] = num_pairs
@@ -180,7 +181,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return self.next_train(step)
 
     def get_train_rays_per_batch(self) -> int:
-        return self.train_pixel_sampler.num_rays_per_batch if self.train_pixel_sampler else 0
+        """Rays of one training step, of events and frames together."""
+        config = self.config
+        pairs = config.event_pairs + config.silent_pairs if "events" in config.supervision else 0
+        return 2 * pairs + (config.train_num_rays_per_batch if "frames" in config.supervision else 0)
 
 
 def concatenate_rays(bundles: list[RayBundle], num_pairs: int) -> PairedRayBundle:

@@ -150,7 +150,7 @@ class EnerfModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        if self.proposal is None:
+        if not isinstance(self.sampler, ProposalNetworkSampler):
             return []
         return [
             TrainingCallback(

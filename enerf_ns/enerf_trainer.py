@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
@@ -67,16 +68,16 @@ class EnerfTrainer(Trainer):
 
     def _after_train(self) -> None:
         super()._after_train()
-        config = self.base_dir / "config.yml"
-        table = Table(title="Training is done", show_header=False, title_justify="left")
+        config = shlex.quote(str(self.base_dir / "config.yml"))
+        CONSOLE.rule("Training is done")
         for what, where in {
             "checkpoint": str(self.checkpoint_dir),
-            "scores": f"ns-eval --load-config {config} --output-path {self.base_dir / 'scores.json'}",
-            "video": f"ns-render interpolate --load-config {config} --output-path {self.base_dir / 'video.mp4'}",
+            "scores, picture and video": f"enerf report {config}",
+            "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
+            "video of your own": f"ns-render interpolate --load-config {config} --output-path video.mp4",
             "look around": f"ns-viewer --load-config {config}",
         }.items():
-            table.add_row(what, where)
-        CONSOLE.print(table)
+            CONSOLE.print(f"[bold]{what}:[/bold] {where}", soft_wrap=True, highlight=False)
 
 
 def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Table:

@@ -127,8 +127,8 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         model.near_plane = near * scale
     if model.max_res is None:
         footprint = math.sqrt(near * far) / recording.camera.fx * scale
-        model.max_res = 2 ** round(math.log2(2.0 * 2.0 / footprint))
-        model.max_res = min(max(model.max_res, 2 * model.base_res), 4096)
+        finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
+        model.max_res = min(max(finest, 2 * model.base_res), 4096)
     add("hash grid", True, f"{model.num_levels} levels, {model.base_res} to {model.max_res} cells", "sensor's pixels")
     return choices
 

@@ -56,6 +56,6 @@ class Demo:
         events = len(pipeline.datamanager.train_dataset.recording.events)
         extra = {"train_seconds": round(train_seconds, 1), "events": events}
         scores = write_scores_and_picture(pipeline, output_dir, extra)
-        render_video(run_config, output_dir / "video.mp4")
+        render_video(pipeline, run_config, output_dir)
         CONSOLE.print(scores)
         CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir}")

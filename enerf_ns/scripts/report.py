@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import torch
 import tyro
+from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_pipeline import EnerfPipeline, HeldOutView, view_scores
 
 PICTURE_ROWS = 3
 """Held-out frames shown in the picture."""
+KEY_POSES = 7
+"""Held-out cameras that the video flies past."""
+VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 
 
 @dataclass
@@ -36,7 +43,7 @@ class Report:
         _, pipeline, _, _ = eval_setup(self.load_config)
         assert isinstance(pipeline, EnerfPipeline)
         scores = write_scores_and_picture(pipeline, output_dir)
-        render_video(self.load_config, output_dir / "video.mp4")
+        render_video(pipeline, self.load_config, output_dir)
         CONSOLE.print(scores)
         CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir.resolve()}")
 
@@ -102,16 +109,54 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     figure.savefig(path)
 
 
-def render_video(load_config: Path, path: Path, steps_between_frames: int = 6) -> None:
-    """A video through the held-out cameras, brightness beside depth, by `ns-render interpolate`."""
-    from nerfstudio.scripts.render import RenderInterpolated
+def render_video(pipeline: EnerfPipeline, load_config: Path, output_dir: Path) -> None:
+    """Write camera_path.json, a smooth flight past some of the held-out cameras, and render it to video.mp4.
 
-    RenderInterpolated(
+    By `ns-render camera-path`; brightness on the left, depth on the right.
+    """
+    from nerfstudio.scripts.render import RenderCameraPath
+
+    path_file = output_dir / "camera_path.json"
+    path_file.write_text(json.dumps(camera_path(pipeline)))
+    model = pipeline.model
+    RenderCameraPath(
         load_config=load_config,
-        output_path=path,
+        output_path=output_dir / "video.mp4",
         rendered_output_names=["rgb", "depth"],
-        pose_source="eval",
-        interpolation_steps=steps_between_frames,
-        order_poses=False,
-        frame_rate=24,
+        camera_path_filename=path_file,
+        depth_near_plane=model.config.near_plane,
+        depth_far_plane=far_plane(pipeline),
     ).main()
+
+
+def far_plane(pipeline: EnerfPipeline) -> float:
+    """Farthest depth of the scene, in scene units."""
+    near, far = pipeline.datamanager.dataparser.config.depth_range
+    return float(pipeline.model.config.near_plane or 0.0) * far / near
+
+
+def camera_path(pipeline: EnerfPipeline) -> dict:
+    """A camera path as the viewer saves it: cubic through the places of `KEY_POSES` held-out cameras, slerp between
+    their directions, with sides of the picture even, as video players want them."""
+    cameras = pipeline.datamanager.eval_dataset.cameras
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, KEY_POSES).round().astype(int))
+    poses = cameras.camera_to_worlds[chosen].double().cpu().numpy()
+    if len(poses) == 1:
+        poses = np.repeat(poses, 2, axis=0)
+    flight = Trajectory(np.arange(len(poses)) * 10**9, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat())
+    times = np.linspace(flight.start, flight.end, int(VIDEO_SECONDS * VIDEO_FPS)).astype(np.int64)
+    matrices = np.concatenate(
+        [flight.poses(torch.from_numpy(times)).numpy(), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(times), 1, 1))], axis=1
+    )
+    height, width = (int(size[0]) // 2 * 2 for size in (cameras.height, cameras.width))
+    fov = math.degrees(2.0 * math.atan(0.5 * height / float(cameras.fy[0])))
+    return {
+        "camera_type": "perspective",
+        "render_height": height,
+        "render_width": width,
+        "fps": VIDEO_FPS,
+        "seconds": VIDEO_SECONDS,
+        "camera_path": [
+            {"camera_to_world": matrix.flatten().tolist(), "fov": fov, "aspect": width / height} for matrix in matrices
+        ],
+    }
