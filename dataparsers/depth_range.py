@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float64
+from rich.progress import track
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import Events
@@ -52,7 +53,7 @@ def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory)
         references = events.t[len(events) // 24 :: len(events) // 12 + 1]
     if extent > 0:
         sweeps = []
-        for level in range(6):
+        for level in track(range(6), "Measuring the depth of the scene", transient=True):
             baseline = extent / 2**level
             for reference in references:
                 chosen = _events_seen_within(baseline / 2, reference, events, path_times, path)
