@@ -75,7 +75,7 @@ allow_numpy_scalars_in_checkpoints()
 enerf = MethodSpecification(
     config=method_config(
         "enerf",
-        iterations=6000,
+        iterations=4000,
         learning_rate=1e-2,
         pipeline=EnerfPipelineConfig(
             datamanager=EnerfDataManagerConfig(), model=EnerfModelConfig(eval_num_rays_per_chunk=1 << 12)

@@ -72,7 +72,7 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
     no_event_margin: float = 0.0
     """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
-    frame_loss_weight: float = 100.0
+    frame_loss_weight: float = 10.0
     """Weight of the loss on frames."""
     opacity_loss_weight: float = 1.0
     """Weight of the share of each ray that no surface stops. 0 for objects in front of nothing."""

@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from enerf_ns.dataparsers.event_dataparser import EventDataParser
+from enerf_ns.dataparsers.event_dataparser import EventDataParser, scene_normalisation
 from enerf_ns.dataparsers.recording import EventRecording, RecordingError
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.scene_choices import Choice, absolute, fill_in_choices
@@ -102,7 +102,9 @@ def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Ta
         depth_note = ", with depth" if frames.depth_filenames else ""
         rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
     if depth is not None:
+        _, scale, box = scene_normalisation(recording, *depth)
         rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
+        rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
     table = Table(title="Recording", show_header=False, title_justify="left")
     for name, value in rows.items():
         table.add_row(name, value)

@@ -73,13 +73,11 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         why = f"{num_on:,} on and {num_off:,} off events; their mean is assumed"
     add("contrast thresholds", use_events, "on {:.3f}, off {:.3f}".format(*model.contrast_thresholds), why)
 
-    silent = use_events and data.silent_pairs > 0
-    add(
-        "no-event loss",
-        silent,
-        f"{data.silent_pairs} silent pairs a step" if silent else "",
-        "datamanager.silent-pairs" + (" is 0; silent pixels are not searched" if not silent else ""),
-    )
+    if use_events and data.silent_pairs:
+        add("no-event loss", True, f"{data.silent_pairs} silent pairs a step", "keeps surfaces without texture even")
+    else:
+        why = "datamanager.silent-pairs is 0; silent pixels are not searched" if use_events else "no events are used"
+        add("no-event loss", False, "", why)
     if use_frames:
         blurred = data.dataparser.train_frames == "blurred" and recording.blurred_frames is not None
         add("frame loss", True, "blurred frames" if blurred else "sharp frames", f"supervision is {data.supervision}")

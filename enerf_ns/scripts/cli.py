@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Annotated, Union  # tyro reads these annotations on Python 3.10
 
 import tyro
@@ -20,6 +21,7 @@ Command = Union[  # noqa: UP007
 
 def entrypoint() -> None:
     """Run the command line; a user's mistake ends it with one sentence."""
+    warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
     command = tyro.cli(Command, description="Radiance fields from event cameras.")
     try:
         command.main()

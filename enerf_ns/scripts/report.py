@@ -7,7 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.enerf_pipeline import EnerfPipeline, HeldOutView, view_scores
+
+if TYPE_CHECKING:
+    from enerf_ns.enerf_pipeline import EnerfPipeline, HeldOutView
 
 PICTURE_ROWS = 3
 """Held-out frames shown in the picture."""
@@ -36,6 +38,8 @@ class Report:
     def main(self) -> None:
         from nerfstudio.utils.eval_utils import eval_setup
         from nerfstudio.utils.rich_utils import CONSOLE
+
+        from enerf_ns.enerf_pipeline import EnerfPipeline
 
         if not self.load_config.is_file():
             raise SystemExit(f"enerf: {self.load_config}: no such file; give the config.yml of a trained run")
@@ -62,6 +66,8 @@ def write_scores_and_picture(
         What scores.json holds: psnr (dB), ssim, lpips (None where its weights are missing), correlation, and with
         known depth depth_rmse and mean_depth (metres); means over the held-out frames.
     """
+    from enerf_ns.enerf_pipeline import view_scores
+
     views, summary = pipeline.held_out_views()
     per_view = [view_scores(view) for view in views]
     scores: dict[str, float | None] = {"psnr": None, "ssim": None, "lpips": None}
