@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from enerf_ns.losses import event_loss, frame_loss, no_event_loss, normalised_event_loss
+from enerf_ns.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 
 PREDICTED = torch.tensor([0.5, -0.25, 0.0])
 MEASURED = torch.tensor([0.25, -0.5, 0.5])
@@ -17,6 +17,15 @@ def test_event_loss_is_the_squared_error_in_thresholds():
 def test_event_loss_does_not_depend_on_the_unit_of_brightness():
     loss = event_loss(PREDICTED, MEASURED, 0.25)
     torch.testing.assert_close(event_loss(3 * PREDICTED, 3 * MEASURED, 0.75), loss)
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),  # in thresholds: e^2 up to one, 2|e| - 1 beyond
+    [(0.0, 0.0), (0.5, 0.25), (-1.0, 1.0), (3.0, 5.0), (-10.0, 19.0)],
+)
+def test_huber_event_loss_is_squared_within_one_threshold_and_linear_beyond(error: float, expected: float):
+    measured = torch.tensor([0.7])
+    assert huber_event_loss(measured + 0.25 * error, measured, 0.25).item() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize(
