@@ -21,7 +21,7 @@ Command = Union[  # noqa: UP007
 
 def entrypoint() -> None:
     """Run the command line; a user's mistake ends it with one sentence."""
-    warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+    warnings.filterwarnings("ignore", module="nerfstudio")
     command = tyro.cli(Command, description="Radiance fields from event cameras.")
     try:
         command.main()

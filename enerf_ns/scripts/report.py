@@ -95,7 +95,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, PICTURE_ROWS).round().astype(int))]
     has_frames = recording.frames is not None or recording.blurred_frames is not None
     height, width = chosen[0].recorded.shape[:2]
-    figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=120)
+    figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=100)
     axes = figure.subplots(len(chosen), 4, squeeze=False)
     near = min(float(view.depth.quantile(0.01)) for view in chosen)
     far = max(float(view.depth.quantile(0.99)) for view in chosen)
@@ -103,7 +103,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     for row, view in zip(axes, chosen, strict=True):
         row[0].imshow(view.recorded.clamp(0, 1).numpy())
         row[1].imshow(view.rendered.clamp(0, 1).numpy())
-        depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo_r", vmin=near, vmax=far)
+        depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo", vmin=near, vmax=far)
         row[3].imshow(event_picture(recording, view.time))
         row[0].set_ylabel(f"{view.time * 1e-9:.2f} s")
         for axis in row:
