@@ -36,7 +36,7 @@ class EventDataParserConfig(DataParserConfig):
     data: Path = Path()
     """Folder of the recording. It is only ever read."""
     held_out_every: int = 4
-    """Every so many frames one is kept from training, for evaluation."""
+    """Every so many frames one is kept from training, for evaluation. 1: all, for learning from events alone."""
     train_frames: Literal["blurred", "sharp"] = "blurred"
     """Which frames to train on, where the recording has both; evaluation is always on sharp ones."""
     depth_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045

@@ -95,6 +95,11 @@ class EventRecording:
         self.frames = self._covered(self.frames, "frames")
         self.blurred_frames = self._covered(self.blurred_frames, "blurred frames")
 
+    @property
+    def has_frames(self) -> bool:
+        """Whether there are frames of any kind."""
+        return self.frames is not None or self.blurred_frames is not None
+
     def __deepcopy__(self, memo: dict) -> EventRecording:
         """The recording itself: it is read-only and large, and Nerfstudio copies what it hands to data sets."""
         return self

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
@@ -27,6 +27,14 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Decay of the running means."""
     fused: bool = True
     """One kernel for the whole step; on a hash grid several times faster than the loop."""
+
+
+@dataclass
+class DecayOverRunSchedulerConfig(ExponentialDecaySchedulerConfig):
+    """Learning rate that falls exponentially from the first step to the last."""
+
+    max_steps: Optional[int] = None  # type: ignore  # noqa: UP045
+    """Step at which lr_final is reached. None: the last step of the run."""
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -61,7 +69,7 @@ def method_config(
         optimizers={
             "fields": {
                 "optimizer": FusedAdamOptimizerConfig(lr=learning_rate, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.1 * learning_rate, max_steps=iterations),
+                "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * learning_rate),
             }
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13, quit_on_train_completion=True),

@@ -268,11 +268,17 @@ class EnerfModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once."""
-        recorded = batch["image"].to(outputs["rgb"].device)[..., :3]
-        aligned = align_brightness([outputs["rgb"]], [recorded])[0][0]
-        images = {"img": torch.cat([recorded, aligned], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
-        return image_metrics(aligned, recorded), images
+        """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once.
+
+        A picture of events has no scores.
+        """
+        recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
+        scores: dict[str, float] = {}
+        if batch["is_frame"]:
+            rendered = align_brightness([rendered], [recorded])[0][0]
+            scores = image_metrics(rendered, recorded)
+        images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
+        return scores, images
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)

@@ -19,6 +19,7 @@ from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import align_brightness, correlation, depth_rmse, image_metrics
+from enerf_ns.event_camera import linlog, luma, measured_change
 
 
 @dataclass
@@ -34,8 +35,8 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
 class HeldOutView:
     """One held-out frame and what the field shows there. Tensors of shape (height, width, channels) on the CPU."""
 
-    recorded: Tensor
-    """Frame in [0, 1], three channels."""
+    recorded: Tensor | None
+    """Frame in [0, 1], three channels; None where the recording has no frames."""
     rendered: Tensor
     """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
     unaligned: Tensor
@@ -63,11 +64,13 @@ class EnerfPipeline(VanillaPipeline):
         """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
 
         Returns:
-            The views, and numbers about the whole set: rendering speed, scale and offset of the brightness fit.
+            The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit; for a
+            recording without frames, the correlation of its events.
         """
         self.eval()
         manager = self.datamanager
         dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
+        has_frames = dataset.recording.has_frames
         views: list[HeldOutView] = []
         start = time.perf_counter()
         for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
@@ -78,7 +81,7 @@ class EnerfPipeline(VanillaPipeline):
             z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
             views.append(
                 HeldOutView(
-                    recorded=data["image"][..., :3],
+                    recorded=data["image"][..., :3] if has_frames else None,
                     rendered=outputs["rgb"].cpu(),
                     unaligned=outputs["rgb"].cpu(),
                     depth=z_depth.cpu(),
@@ -88,23 +91,44 @@ class EnerfPipeline(VanillaPipeline):
             )
         seconds = time.perf_counter() - start
         summary = {
-            "num_rays_per_sec": sum(view.recorded[..., 0].numel() for view in views) / seconds,
+            "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
             "fps": len(views) / seconds,
         }
-        if manager.config.supervision == "events":
-            aligned, (scale, offset) = align_brightness(
-                [view.rendered for view in views], [view.recorded for view in views]
-            )
+        if not has_frames:
+            summary["event_correlation"] = self.event_correlation()
+        elif manager.config.supervision == "events":
+            recorded = [view.recorded for view in views if view.recorded is not None]
+            aligned, (scale, offset) = align_brightness([view.rendered for view in views], recorded)
             for view, image in zip(views, aligned, strict=True):
                 view.rendered = image
             summary |= {"brightness_scale": scale, "brightness_offset": offset}
         self.train()
         return views, summary
 
+    @torch.no_grad()
+    def event_correlation(self, num_pairs: int = 8192) -> float:
+        """Linear correlation of rendered and measured changes of log brightness over random event pairs.
+
+        What can be said of a field whose recording has no frames; the pairs are drawn from those of the training.
+        """
+        self.eval()
+        manager, thresholds = self.datamanager, self.model.config.contrast_thresholds
+        assert thresholds is not None
+        manager.setup_events(manager.eval_dataset.recording)
+        generator = torch.Generator(self.device).manual_seed(0)
+        pairs = manager.pair_sampler.sample(num_pairs, generator)
+        rays = manager.event_rays(pairs.pixels.repeat(2), torch.cat([pairs.start, pairs.end])).reshape((2, num_pairs))
+        rendered = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
+        start, end = linlog(luma(rendered))
+        self.train()
+        return correlation(end - start, measured_change(pairs.on, pairs.off, thresholds))
+
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
         """Mean scores over the held-out frames: psnr, ssim, correlation, and lpips and depth_rmse where available.
+
+        Of a recording without frames, the correlation of its events alone.
 
         Args:
             step: Ignored; Nerfstudio passes it.
@@ -116,7 +140,8 @@ class EnerfPipeline(VanillaPipeline):
         if output_path is not None:
             output_path.mkdir(parents=True, exist_ok=True)
             for index, view in enumerate(views):
-                picture = torch.cat([view.recorded, view.rendered], dim=1).clamp(0.0, 1.0)
+                shown = [view.rendered] if view.recorded is None else [view.recorded, view.rendered]
+                picture = torch.cat(shown, dim=1).clamp(0.0, 1.0)
                 Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(
                     output_path / f"eval_img_{index:04d}.png"
                 )
@@ -129,7 +154,12 @@ class EnerfPipeline(VanillaPipeline):
 
 
 def view_scores(view: HeldOutView) -> dict[str, float]:
-    """Scores of one held-out frame. The correlation is that of the render as it is, before brightness is aligned."""
+    """Scores of one held-out frame; none where there is no frame.
+
+    The correlation is that of the render as it is, before brightness is aligned.
+    """
+    if view.recorded is None:
+        return {}
     scores = image_metrics(view.rendered, view.recorded)
     scores["correlation"] = correlation(view.unaligned, view.recorded)
     perceptual = lpips(view.rendered, view.recorded)

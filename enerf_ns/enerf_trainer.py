@@ -26,7 +26,7 @@ class EnerfTrainerConfig(TrainerConfig):
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
 
     def prepare(self) -> tuple[EventRecording, list[Choice]]:
-        """Read the recording and fill in what depends on it: paths, experiment name, choices.
+        """Read the recording and fill in what is open: paths, decay of the learning rate, choices.
 
         Raises:
             RecordingError: if the recording cannot be used. Nothing has been written then.
@@ -40,6 +40,8 @@ class EnerfTrainerConfig(TrainerConfig):
             raise RecordingError("--data is missing; give the folder of a recording")
         self.data = manager.data = manager.dataparser.data = absolute(self.data)
         self.output_dir = absolute(self.output_dir)
+        for group in self.optimizers.values():
+            group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         recording = EventDataParser(manager.dataparser).recording()
         choices = fill_in_choices(self.pipeline, recording)
         recording.events  # noqa: B018 - reads and checks them

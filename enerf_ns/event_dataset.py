@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from enerf_ns.dataparsers.recording import EventRecording, Frames, load_image
+from enerf_ns.dataparsers.recording import EventRecording, Frames, load_array, load_image
 
 EVENTS_IN_PICTURE = 0.2
 """Events drawn into one picture, as a share of the sensor's pixels."""
@@ -22,16 +22,19 @@ class EventDataset(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """Picture of shape (height, width, 3), uint8."""
-        if self.recording.frames is None and self.recording.blurred_frames is None:
+        if not self.recording.has_frames:
             return event_picture(self.recording, int(self.frames.times[image_idx]))
         image = self.frames.camera.undistort(load_image(self.frames.filenames[image_idx]))
         return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
     def get_metadata(self, data: dict) -> dict:
-        """Depth in metres along the optical axis (height, width, 1), 0 where unknown, if the recording has it."""
-        if self.frames.depth_filenames is None:
-            return {}
-        return {"depth": torch.from_numpy(np.load(self.frames.depth_filenames[data["image_idx"]]))[..., None].float()}
+        """is_frame: whether the picture is a frame. depth, where the recording has it: metres along the optical axis
+        (height, width, 1), 0 where unknown."""
+        metadata: dict = {"is_frame": self.recording.has_frames}
+        if self.frames.depth_filenames is not None:
+            depth = load_array(self.frames.depth_filenames[data["image_idx"]])
+            metadata["depth"] = torch.from_numpy(depth)[..., None].float()
+        return metadata
 
 
 def event_picture(recording: EventRecording, time: int) -> np.ndarray:

@@ -45,12 +45,23 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         choices.append(Choice(part, kept, value, why))
 
     use_events, use_frames = "events" in data.supervision, "frames" in data.supervision
-    has_frames = recording.frames is not None or recording.blurred_frames is not None
+    has_frames = recording.has_frames
     if use_frames and not has_frames:
         raise RecordingError(
             f"{recording.path}: the recording holds no frames, but --pipeline.datamanager.supervision "
             f"{data.supervision} learns from them; use --pipeline.datamanager.supervision events"
         )
+    parser = data.dataparser
+    assert isinstance(parser, EventDataParserConfig)
+    frames = recording.blurred_frames or recording.frames
+    num_frames = len(frames.times) if frames else 0
+    if parser.held_out_every < 1 or (use_frames and not 1 <= parser.held_out_every // 2 < num_frames):
+        raise RecordingError(
+            f"{recording.path}: --held-out-every {parser.held_out_every} splits none of {num_frames} frames off; it "
+            "must be at least 1, and where the field learns from frames at least 2 and less than twice their number"
+        )
+    if model.contrast_thresholds is not None and min(model.contrast_thresholds) <= 0.0:
+        raise RecordingError(f"--contrast-thresholds are {model.contrast_thresholds}, but both must be above 0")
 
     if use_events:
         values = {
@@ -92,7 +103,6 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         )
 
     if model.num_channels is None:
-        frames = recording.blurred_frames or recording.frames
         colour = use_frames and frames is not None and is_colour(load_image(frames.filenames[0]))
         model.num_channels = 3 if colour else 1
     why = "the field learns from colour frames" if model.num_channels == 3 else "nothing here is in colour"
@@ -111,8 +121,6 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         "model.view-direction" + ("" if model.view_direction else " is off: brightness as of matt surfaces"),
     )
 
-    parser = data.dataparser
-    assert isinstance(parser, EventDataParserConfig)
     if parser.depth_range is not None:
         why = "set by flag"
     else:

@@ -360,3 +360,34 @@ def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path
     with pytest.raises(SystemExit, match=r"enerf: .*recording") as error:
         set_up(small_config(recording, tmp_path, **changes))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "held_out_every", "message"),
+    [
+        ({}, 0, "--held-out-every 0"),
+        ({"data__supervision": "frames"}, 1, "--held-out-every 1 .*11 frames"),
+        ({"data__supervision": "events+frames"}, 22, "--held-out-every 22 .*11 frames"),
+        ({"model__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
+    ],
+)
+def test_flags_that_cannot_be_followed(
+    recording: Path, tmp_path: Path, changes: dict, held_out_every: int, message: str
+):
+    config = small_config(recording, tmp_path, **changes)
+    config.pipeline.datamanager.dataparser.held_out_every = held_out_every
+    with pytest.raises(SystemExit, match=message):
+        config.save_config()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_learning_rate_falls_to_a_tenth_at_the_last_step_however_long_the_run(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations = 7
+    trainer = set_up(config)
+    rates = []
+    for step in range(8):
+        rates.append(trainer.optimizers.optimizers["fields"].param_groups[0]["lr"])
+        trainer.train_iteration(step)
+    ratio = np.array(rates[1:]) / np.array(rates[:-1])
+    np.testing.assert_allclose(ratio, 0.1 ** (1 / 7), rtol=1e-6)

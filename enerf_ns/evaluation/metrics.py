@@ -48,9 +48,7 @@ def image_metrics(
     return {"psnr": float(psnr), "ssim": float(ssim)}
 
 
-def correlation(
-    rendered: Float[Tensor, "height width channels"], recorded: Float[Tensor, "height width channels"]
-) -> float:
+def correlation(rendered: Float[Tensor, "*shape"], recorded: Float[Tensor, "*shape"]) -> float:
     """Linear (Pearson) correlation of two pictures, blind to scale and offset of brightness; 0 if one is flat."""
     pixels = torch.stack([rendered.flatten(), recorded.flatten()]).double()
     return float(torch.corrcoef(pixels)[0, 1].nan_to_num())

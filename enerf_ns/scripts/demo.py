@@ -42,8 +42,6 @@ class Demo:
         config.steps_per_eval_image = config.steps_per_eval_batch
         if self.max_num_iterations is not None:
             config.max_num_iterations = self.max_num_iterations
-            for group in config.optimizers.values():
-                group["scheduler"].max_steps = self.max_num_iterations
         config.set_timestamp()
         config.save_config()
         start = time.perf_counter()

@@ -64,7 +64,8 @@ def write_scores_and_picture(
 
     Returns:
         What scores.json holds: psnr (dB), ssim, lpips (None where its weights are missing), correlation, and with
-        known depth depth_rmse and mean_depth (metres); means over the held-out frames.
+        known depth depth_rmse and mean_depth (metres); means over the held-out frames. Without frames the first three
+        are None, and event_correlation stands for them.
     """
     from enerf_ns.enerf_pipeline import view_scores
 
@@ -93,15 +94,15 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
 
     recording = pipeline.datamanager.eval_dataset.recording
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, PICTURE_ROWS).round().astype(int))]
-    has_frames = recording.frames is not None or recording.blurred_frames is not None
-    height, width = chosen[0].recorded.shape[:2]
+    height, width = chosen[0].depth.shape[:2]
     figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=100)
     axes = figure.subplots(len(chosen), 4, squeeze=False)
     near = min(float(view.depth.quantile(0.01)) for view in chosen)
     far = max(float(view.depth.quantile(0.99)) for view in chosen)
-    titles = ("held-out frame" if has_frames else "events", "render", "depth", "events")
+    titles = ("held-out frame", "render", "depth", "events")
     for row, view in zip(axes, chosen, strict=True):
-        row[0].imshow(view.recorded.clamp(0, 1).numpy())
+        if view.recorded is not None:
+            row[0].imshow(view.recorded.clamp(0, 1).numpy())
         row[1].imshow(view.rendered.clamp(0, 1).numpy())
         depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo", vmin=near, vmax=far)
         row[3].imshow(event_picture(recording, view.time))
