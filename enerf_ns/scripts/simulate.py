@@ -71,6 +71,10 @@ class Simulate:
             if output_dir.exists():
                 output_dir.rmdir()
             partial.rename(output_dir)
+        except OSError as error:
+            raise RecordingError(
+                f"{output_dir} could not be written ({error}), and nothing was left there; is the disk full?"
+            ) from error
         finally:
             shutil.rmtree(partial, ignore_errors=True)
         CONSOLE.print(f"{summary} are in {output_dir}")
