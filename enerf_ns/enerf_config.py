@@ -72,10 +72,13 @@ def method_config(
                 "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * learning_rate),
             }
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 13, quit_on_train_completion=True),
+        viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer",
     )
 
+
+RAYS_PER_CHUNK = 1 << (15 if torch.cuda.is_available() else 12)
+"""Rays rendered at once: enough to keep the device busy, few enough for the cache of a CPU."""
 
 make_ffmpeg_available()
 allow_numpy_scalars_in_checkpoints()
@@ -86,7 +89,7 @@ enerf = MethodSpecification(
         iterations=4000,
         learning_rate=1e-2,
         pipeline=EnerfPipelineConfig(
-            datamanager=EnerfDataManagerConfig(), model=EnerfModelConfig(eval_num_rays_per_chunk=1 << 12)
+            datamanager=EnerfDataManagerConfig(), model=EnerfModelConfig(eval_num_rays_per_chunk=RAYS_PER_CHUNK)
         ),
     ),
     description="E-NeRF: radiance field from an event camera, tuned for error against time.",
@@ -122,7 +125,7 @@ enerf_paper = MethodSpecification(
                 frame_loss_weight=1.0,
                 opacity_loss_weight=0.0,
                 distortion_loss_weight=0.0,
-                eval_num_rays_per_chunk=1 << 12,
+                eval_num_rays_per_chunk=RAYS_PER_CHUNK,
             ),
         ),
     ),

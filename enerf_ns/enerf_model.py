@@ -34,8 +34,6 @@ class EnerfModelConfig(ModelConfig):
     """E-NeRF. What is None is chosen from the recording when training starts, and stored in config.yml."""
 
     _target: Type = field(default_factory=lambda: EnerfModel)  # noqa: UP006
-    enable_collider: bool = True
-    """Intersect rays with the scene box."""
     num_levels: int = 10
     """Levels of the hash grid."""
     base_res: int = 16
@@ -124,7 +122,6 @@ class EnerfModel(Model):
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
         )
-        initial = UniformSampler(single_jitter=True)
         self.proposal = None
         if config.sampling == "proposal":
             self.proposal = HashDensity(
@@ -134,7 +131,7 @@ class EnerfModel(Model):
                 num_proposal_samples_per_ray=(config.num_proposal_samples,),
                 num_nerf_samples_per_ray=config.num_samples,
                 num_proposal_network_iterations=1,
-                initial_sampler=initial,
+                initial_sampler=UniformSampler(single_jitter=True),
                 pdf_sampler=PDFSampler(include_original=False, single_jitter=True),
                 update_sched=lambda step: 1 if step > 500 else 0,
             )
