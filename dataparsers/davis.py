@@ -10,13 +10,12 @@ Mueggler et al., "The event-camera dataset and simulator", International Journal
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from decimal import Decimal, InvalidOperation
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from rich.progress import Progress
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import (
@@ -36,9 +35,7 @@ DAVIS240C_SIZE = (240, 180)
 """Width and height of the sensor in pixels, where there are no frames to tell."""
 
 EVENT_COLUMNS = "t_s x y p"
-BYTES_AT_A_TIME = 2**24
-BYTES_WITH_PROGRESS = 2 * 10**8
-"""Files from this size on take more than two seconds, so that a progress bar is shown."""
+BYTES_AT_A_TIME = 2**22
 
 
 def read(folder: Path) -> EventRecording:
@@ -58,6 +55,7 @@ def read(folder: Path) -> EventRecording:
     frame_files, frame_times = _read_frame_list(folder, notes)
     first_stamps = [_first_event_time(events_file), pose_times[0], *frame_times[:1]]
     zero = int(min(first_stamps))
+    num_bytes = events_file.stat().st_size
 
     width, height = image_size(frame_files[0]) if frame_files else DAVIS240C_SIZE
     for frame_file in frame_files:
@@ -69,7 +67,8 @@ def read(folder: Path) -> EventRecording:
         format="davis",
         camera=camera,
         trajectory=trajectory,
-        load_events=lambda: _read_events(events_file, zero),
+        stream_events=lambda: _stream_events(events_file, num_bytes, zero),
+        event_files=(events_file,),
         frames=Frames(frame_files, frame_times - zero, camera, trajectory) if frame_files else None,
         notes=notes,
         locate_event=lambda index: f"{events_file}, line {index + 1}",
@@ -120,33 +119,27 @@ def _first_event_time(path: Path) -> int:
     return int(columns[0][0])
 
 
-def _read_events(path: Path, zero: int) -> Events:
-    """All events as they are in the file, times in nanoseconds from `zero`."""
-    text = np.memmap(path, np.uint8, mode="r")
+def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
+    """The events of the first bytes of the file, times in nanoseconds from `zero`."""
+    text = np.memmap(path, np.uint8, mode="r")[:num_bytes]
     end = len(text)
     while end and text[end - 1] in b" \t\r\n":
         end -= 1
-    parse, pieces, num_events, start = _line_parser(), [], 0, 0
-    with Progress(transient=True, disable=len(text) < BYTES_WITH_PROGRESS) as progress:
-        task = progress.add_task(f"Reading {path.name}", total=end)
-        while start < end:
-            stop = min(start + BYTES_AT_A_TIME, end)
-            while stop < end and text[stop - 1] != ord("\n"):
-                stop += 1
-            piece = np.asarray(text[start:stop])
-            num_lines = np.count_nonzero(piece == ord("\n")) + (piece[-1] != ord("\n"))
-            columns = tuple(np.empty(num_lines, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
-            parsed = parse(piece, *columns)
-            if parsed < num_lines:
-                line = piece.tobytes().split(b"\n", parsed + 1)[parsed]
-                raise _bad_line(path, num_events + parsed + 1, line)
-            pieces.append(columns)
-            num_events += parsed
-            start = stop
-            progress.update(task, completed=start)
-    t, x, y, p = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    t -= zero
-    return Events(x, y, t, p)
+    parse, num_events, start = _line_parser(), 0, 0
+    while start < end:
+        stop = min(start + BYTES_AT_A_TIME, end)
+        while stop < end and text[stop - 1] != ord("\n"):
+            stop += 1
+        piece = np.asarray(text[start:stop])
+        num_lines = np.count_nonzero(piece == ord("\n")) + (piece[-1] != ord("\n"))
+        t, x, y, p = (np.empty(num_lines, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
+        parsed = parse(piece, t, x, y, p)
+        if parsed < num_lines:
+            line = piece.tobytes().split(b"\n", parsed + 1)[parsed]
+            raise _bad_line(path, num_events + parsed + 1, line)
+        yield Events(x, y, t - zero, p)
+        num_events += parsed
+        start = stop
 
 
 def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:

@@ -14,14 +14,14 @@ One camera takes events and frames, without distortion, and stamps are nanosecon
 from __future__ import annotations
 
 import json
-from bisect import bisect_right
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import (
+    EVENTS_AT_A_TIME,
     EventRecording,
     Events,
     Frames,
@@ -33,9 +33,6 @@ from enerf_ns.dataparsers.text_tables import read_poses, read_times
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
-
-BYTES_WITH_PROGRESS = 10**9
-"""Events from this size on take more than two seconds to read, so that a progress bar is shown."""
 
 
 def read(folder: Path) -> EventRecording:
@@ -68,19 +65,21 @@ def read(folder: Path) -> EventRecording:
 
     frames = _read_frames(folder / "images", camera, trajectory)
     blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory)
-    starts: list[int] = []
+    num_rows = [_num_rows(file) for file in event_files]
     return EventRecording(
         path=folder,
         format="esim",
         camera=camera,
         trajectory=trajectory,
-        load_events=lambda: _read_events(event_files, starts),
+        stream_events=lambda: _stream_events(event_files, num_rows),
+        event_files=tuple(event_files),
         frames=frames,
         blurred_frames=blurred_frames,
         contrast_thresholds=contrast_thresholds,
         depth_range=depth_range,
         notes=notes,
-        locate_event=lambda index: _locate(event_files, starts, index),
+        locate_event=lambda index: _locate(event_files, num_rows, index),
+        num_events=sum(num_rows),
     )
 
 
@@ -167,35 +166,45 @@ def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory) -> Frames
     return Frames(files, times, camera, trajectory, depth_files)
 
 
-def _read_events(files: list[Path], starts: list[int]) -> Events:
-    """All events as they are in the files; `starts` gets the index of each file's first event."""
-    columns: list[tuple[np.ndarray, ...]] = []
-    num_events = 0
-    large = sum(file.stat().st_size for file in files) >= BYTES_WITH_PROGRESS
-    for file in track(files, "Reading events", transient=True, disable=not large):
-        rows = load_array(file)
-        if rows.ndim != 2 or rows.shape[1] not in (4, 5):
-            raise RecordingError(f"{file} holds an array of shape {rows.shape}, but (n, 4) was expected: x y t_ns p.")
-        limits = (("x", 2**31), ("y", 2**31), ("t", 2**62), ("p", 2**31))
-        for column, (name, limit) in zip(rows.T, limits, strict=False):
-            if rows.dtype.kind == "f":
-                good = (np.abs(column) < limit) & ((column == np.rint(column)) | (name == "t"))
-                if not good.all():
-                    bad = int(np.argmin(good))
-                    expected = "a finite time in ns" if name == "t" else "a whole number"
-                    raise RecordingError(
-                        f"{file}, event {bad + 1} holds {name} = {column[bad]:g}, where {expected} was expected."
-                    )
-        x, y, p = (rows[:, i].astype(np.int32) for i in (0, 1, 3))
-        columns.append((x, y, np.rint(rows[:, 2]).astype(np.int64), p))
-        starts.append(num_events)
-        num_events += len(rows)
-    return Events(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
+    """All events as they are in the files."""
+    for file, length in zip(files, num_rows, strict=True):
+        rows = load_array(file, mmap_mode="r")
+        if len(rows) < length:
+            raise RecordingError(f"{file} became shorter while it was read; read the recording again.")
+        for start in range(0, length, EVENTS_AT_A_TIME):
+            yield _events(file, rows[start : min(start + EVENTS_AT_A_TIME, length)], start)
 
 
-def _locate(files: list[Path], starts: list[int], index: int) -> str:
-    file = bisect_right(starts, index) - 1
-    return f"{files[file]}, event {index - starts[file] + 1}"
+def _events(file: Path, rows: np.ndarray, start: int) -> Events:
+    """Events from rows (n, 4) x y t_ns p of any type of number; `start` is the number of the first row in its file."""
+    limits = (("x", 2**31), ("y", 2**31), ("t", 2**62), ("p", 2**31))
+    for column, (name, limit) in zip(rows.T, limits, strict=False):
+        if rows.dtype.kind == "f":
+            good = (np.abs(column) < limit) & ((column == np.rint(column)) | (name == "t"))
+            if not good.all():
+                bad = int(np.argmin(good))
+                expected = "a finite time in ns" if name == "t" else "a whole number"
+                raise RecordingError(
+                    f"{file}, event {start + bad + 1} holds {name} = {column[bad]:g}, where {expected} was expected."
+                )
+    x, y, p = (rows[:, i].astype(np.int32) for i in (0, 1, 3))
+    return Events(x, y, np.rint(rows[:, 2]).astype(np.int64), p)
+
+
+def _num_rows(file: Path) -> int:
+    rows = load_array(file, mmap_mode="r")
+    if rows.ndim != 2 or rows.shape[1] not in (4, 5):
+        raise RecordingError(f"{file} holds an array of shape {rows.shape}, but (n, 4) was expected: x y t_ns p.")
+    return len(rows)
+
+
+def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
+    for file, length in zip(files, num_rows, strict=True):
+        if index < length:
+            return f"{file}, event {index + 1}"
+        index -= length
+    return str(files[-1])
 
 
 def _is_positive(number: object) -> bool:

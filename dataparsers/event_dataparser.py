@@ -24,6 +24,9 @@ from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingErro
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
 
+EVENTS_FOR_DEPTH = 4_000_000
+"""Of more events, so many measure the depth of the scene."""
+
 NUM_EVENT_PICTURES = 48
 """Cameras along the trajectory that stand in for frames where a recording has none."""
 
@@ -41,6 +44,16 @@ class EventDataParserConfig(DataParserConfig):
     """Which frames to train on, where the recording has both; evaluation is always on sharp ones."""
     depth_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """Nearest and farthest depth of the scene in metres. None: the recording's own, else measured from its events."""
+    box: Optional[Tuple[float, float, float, float]] = None  # noqa: UP006, UP045
+    """Cube around the scene: x y z of its middle and half its side, metres. None: all that the cameras see."""
+    time_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
+    """First and last second that is used, on the recording's clock. None: all."""
+    keep_hot_pixels: bool = False
+    """Use pixels that fire far more often than their neighbourhood."""
+    train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
+    """Numbers of the frames to train on, from 0. None: all that are not held out."""
+    held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
+    """Numbers of the frames kept for evaluation, from 0. None: by held-out-every."""
 
 
 @dataclass
@@ -49,11 +62,48 @@ class EsimDataParserConfig(EventDataParserConfig):
 
 
 @dataclass
+class EsimNpzDataParserConfig(EventDataParserConfig):
+    """A simulated recording as Robust e-NeRF prepares it."""
+
+
+@dataclass
+class EsimBagDataParserConfig(EventDataParserConfig):
+    """A simulated recording as Robust e-NeRF publishes it: esim.bag."""
+
+
+@dataclass
 class DavisDataParserConfig(EventDataParserConfig):
     """A recording in the text format of the UZH event-camera dataset (DAVIS240C)."""
 
 
-FORMATS = {EventDataParserConfig: "auto", EsimDataParserConfig: "esim", DavisDataParserConfig: "davis"}
+@dataclass
+class EdsDataParserConfig(EventDataParserConfig):
+    """A recording of EDS, as published or as prepared by E-NeRF's reference code."""
+
+
+@dataclass
+class TumVieDataParserConfig(EventDataParserConfig):
+    """A recording of TUM-VIE, as published or as prepared by E-NeRF's reference code."""
+
+    event_camera: Literal["left", "right"] = "left"
+    """Which of the two event cameras, with the frame camera beside it."""
+
+
+@dataclass
+class EventRecordingDataParserConfig(EventDataParserConfig):
+    """A recording of your own, in the folder layout of this package."""
+
+
+FORMATS = {
+    EventDataParserConfig: "auto",
+    EsimDataParserConfig: "esim",
+    EsimNpzDataParserConfig: "esim_npz",
+    EsimBagDataParserConfig: "esim_bag",
+    DavisDataParserConfig: "davis",
+    EdsDataParserConfig: "eds",
+    TumVieDataParserConfig: "tum_vie",
+    EventRecordingDataParserConfig: "event_recording",
+}
 
 
 @dataclass
@@ -64,7 +114,10 @@ class EventDataParser(DataParser):
 
     def recording(self) -> EventRecording:
         """The recording of this parser's folder, read once per process."""
-        return read_recording(self.config.data, FORMATS[type(self.config)])
+        config = self.config
+        options = {"event_camera": config.event_camera} if isinstance(config, TumVieDataParserConfig) else {}
+        selection = config.time_range and tuple(config.time_range), config.keep_hot_pixels
+        return read_recording(config.data, FORMATS[type(config)], *selection, **options)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         try:
@@ -83,7 +136,7 @@ class EventDataParser(DataParser):
             RecordingError: if the depth of the scene is neither known nor observable.
         """
         near, far = depth_range(recording, self.config)
-        transform, scale, box = scene_normalisation(recording, near, far)
+        transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
         frames = split_frames(recording, self.config, held_out=split != "train")
 
         poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
@@ -107,7 +160,7 @@ class EventDataParser(DataParser):
             image_filenames=list(frames.filenames),
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.from_numpy(box).float()),
-            metadata={"recording": recording, "frames": frames},
+            metadata={"recording": recording, "frames": frames, "are_frames": frames.filenames[0].exists()},
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
@@ -122,7 +175,8 @@ def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tup
     chosen = config.depth_range or recording.depth_range
     if chosen is None:
         try:
-            chosen = estimate_depth_range(recording.events, recording.camera, recording.trajectory)
+            events = recording.index.events(at_most=EVENTS_FOR_DEPTH)
+            chosen = estimate_depth_range(events, recording.camera, recording.trajectory)
         except ValueError as error:
             raise RecordingError(
                 f"{recording.path}: {str(error).rstrip('.')}, with --depth-range NEAR FAR of the data parser (metres)."
@@ -133,21 +187,26 @@ def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tup
     return near, far
 
 
-def scene_normalisation(recording: EventRecording, near: float, far: float) -> tuple[np.ndarray, float, np.ndarray]:
+def scene_normalisation(
+    recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
+) -> tuple[np.ndarray, float, np.ndarray]:
     """Where the scene lies, seen from every pose of the event camera between the nearest and the farthest depth.
 
     Args:
         recording: Trajectory and camera.
         near: Nearest depth in metres.
         far: Farthest depth in metres.
+        cube: Middle and half side in metres of a cube along the axes of the world, where the scene is known to be.
 
     Returns:
         transform (3, 4) and scale, so that a world point p becomes scale * (transform @ [p, 1]): the mean up direction
         of the cameras turned to +z, the middle of what they see moved to the origin; and the box (2, 3) of what they
-        see, in scene units, whose longest side is 2.
+        see, in scene units, whose longest side is 2. Of a cube, the world is not turned.
     """
+    if cube is not None:
+        return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])
     trajectory, camera = recording.trajectory, recording.camera
-    times = np.linspace(trajectory.start, trajectory.end, 100).astype(np.int64)
+    times = np.linspace(*recording.span, 100).astype(np.int64)
     poses = trajectory.poses(torch.from_numpy(times)).numpy()
     up = -poses[:, :, 1].mean(axis=0)
     rotation = np.eye(3)
@@ -169,23 +228,35 @@ def scene_normalisation(recording: EventRecording, near: float, far: float) -> t
 
 def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> Frames:
     """The frames of one split; where the recording has none, instants along its trajectory to picture events at."""
-    sharp = recording.frames or recording.blurred_frames or event_pictures(recording)
-    frames = sharp
+    if held_out and recording.held_out_frames:
+        return recording.held_out_frames
+    frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     if not held_out and config.train_frames == "blurred" and recording.blurred_frames:
         frames = recording.blurred_frames
-    index = np.arange(len(frames.times))
-    chosen = (index % config.held_out_every == config.held_out_every // 2) == held_out
-    if not chosen.any():
-        chosen[:] = True
-    return frames.subset(np.flatnonzero(chosen))
+    start, end = recording.span
+    used = (frames.times >= start) & (frames.times <= end)
+    if not used.any():
+        used[:] = True
+    if config.held_out_frame_indices is not None:
+        evaluated = np.isin(frames.numbers, config.held_out_frame_indices)
+    elif recording.held_out_frames:
+        evaluated = np.zeros_like(used)
+    else:
+        evaluated = used & ((np.cumsum(used) - 1) % config.held_out_every == config.held_out_every // 2)
+    if held_out:
+        chosen = evaluated
+    elif config.train_frame_indices is not None:
+        chosen = np.isin(frames.numbers, config.train_frame_indices)
+    else:
+        chosen = used & ~evaluated
+    return frames.subset(np.flatnonzero(chosen if chosen.any() else used))
 
 
 def event_pictures(recording: EventRecording) -> Frames:
     """Instants along the trajectory, for a recording without frames; their file names stand for no file."""
-    trajectory = recording.trajectory
-    times = np.linspace(trajectory.start, trajectory.end, NUM_EVENT_PICTURES + 2)[1:-1].astype(np.int64)
+    times = np.linspace(*recording.span, NUM_EVENT_PICTURES + 2)[1:-1].astype(np.int64)
     names = tuple(recording.path / f"events_{i:05d}.png" for i in range(len(times)))
-    return Frames(filenames=names, times=times, camera=recording.camera, trajectory=trajectory)
+    return Frames(filenames=names, times=times, camera=recording.camera, trajectory=recording.trajectory)
 
 
 event_data = DataParserSpecification(
@@ -194,6 +265,22 @@ event_data = DataParserSpecification(
 esim_events = DataParserSpecification(
     config=EsimDataParserConfig(), description="Events in the folder layout of E-NeRF's ESIM sequences."
 )
+esim_npz = DataParserSpecification(
+    config=EsimNpzDataParserConfig(), description="Events in the .npz layout of Robust e-NeRF's simulated sequences."
+)
+esim_bag = DataParserSpecification(
+    config=EsimBagDataParserConfig(), description="Events in esim.bag of Robust e-NeRF's simulated sequences."
+)
 davis_events = DataParserSpecification(
     config=DavisDataParserConfig(), description="Events in the text format of the UZH event-camera dataset."
+)
+eds_events = DataParserSpecification(
+    config=EdsDataParserConfig(), description="Events of EDS, as published or prepared by E-NeRF's reference code."
+)
+tumvie_events = DataParserSpecification(
+    config=TumVieDataParserConfig(),
+    description="Events of TUM-VIE, as published or prepared by E-NeRF's reference code.",
+)
+event_recording = DataParserSpecification(
+    config=EventRecordingDataParserConfig(), description="Events in the folder layout of enerf-ns, from any camera."
 )

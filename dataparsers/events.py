@@ -1,16 +1,36 @@
-"""The per-pixel index of a recording's events, from which the samplers draw."""
+"""The per-pixel index of a recording's events, from which everything that looks at events draws."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Int32, Int64
+from jaxtyping import Int, Int32, Int64, UInt8
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from scipy.ndimage import median_filter
 from torch import Tensor
 
 from enerf_ns.dataparsers.recording import Events
+
+if TYPE_CHECKING:
+    from enerf_ns.dataparsers.calibration import Camera
+
+HOT_RATIO = 10
+"""A hot pixel fires more often than its neighbourhood's median by this factor; edges that pass stay far below."""
+
+HOT_FLOOR = 5
+"""Events that every neighbourhood is credited with, so that a few events in a plain region make no pixel hot."""
+
+EVENTS_IN_PICTURE = 0.2
+"""Events drawn into one picture, as a share of the sensor's pixels."""
+
+SILENT_SECONDS = 2.0
+"""How long indexing goes on before a progress bar is shown."""
 
 
 @dataclass(frozen=True)
@@ -24,56 +44,297 @@ class EventIndex:
     pixel, (i, j] holds positives[j] - positives[i] positive ones, and the other j - i - that many are negative."""
     offsets: Int64[Tensor, " pixels+1"]
     """The events of pixel p are offsets[p] to offsets[p + 1] - 1."""
+    width: int
+    """Of the sensor, pixels."""
+    hot_pixels: Int64[Tensor, " hot"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    """Numbers of the pixels whose events were left out."""
+
+    def __len__(self) -> int:
+        return len(self.times)
 
     @classmethod
     def from_events(cls, events: Events, width: int, height: int) -> EventIndex:
         """Sorts events by pixel: a stable counting sort, linear in the number of events.
 
         Args:
-            events: In time order.
+            events: In time order; polarity ±1 or {0, 1}.
             width, height: Of the sensor, pixels.
 
         Raises:
             ValueError: An event outside the sensor, or 2^31 events and more.
         """
-        if len(events) and (events.x.max() >= width or events.y.max() >= height):
-            raise ValueError(
-                f"An event lies at x = {events.x.max()} or y = {events.y.max()}, outside the {width} x {height} sensor."
-            )
+        survey = survey_events(lambda: iter([events]), width, height, -(2**63), 2**63 - 1)
+        if survey.outside is not None:
+            x, y = events.x[survey.outside], events.y[survey.outside]
+            raise ValueError(f"An event lies at x = {x}, y = {y}, outside the {width} x {height} sensor.")
         if len(events) >= 2**31:
             raise ValueError(
                 f"The index holds fewer than 2^31 events, but the recording has {len(events)}: shorten it."
             )
-        sort = _compiled_counting_sort()
-        times, positives, offsets = sort(events.x, events.y, events.t, events.p, width, height)
-        return cls(torch.from_numpy(times), torch.from_numpy(positives), torch.from_numpy(offsets))
+        times, positives = next(sorted_bands(lambda: iter([events]), survey, max_events=2**31))
+        return cls(torch.from_numpy(times), torch.from_numpy(positives), survey.offsets, width)
 
     def to(self, device: torch.device | str) -> EventIndex:
         """The same index on another device."""
-        return EventIndex(self.times.to(device), self.positives.to(device), self.offsets.to(device))
+        times, positives, offsets = (column.to(device) for column in (self.times, self.positives, self.offsets))
+        return EventIndex(times, positives, offsets, self.width, self.hot_pixels.to(device))
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last time, ns."""
+        active = self.offsets.diff() > 0
+        first, last = self.offsets[:-1][active], self.offsets[1:][active] - 1
+        return int(self.times[first].min()), int(self.times[last].max())
+
+    @property
+    def num_positive(self) -> int:
+        """Number of positive events; the others are negative."""
+        return int(self.positives[-1]) if len(self) else 0
+
+    def count_until(self, pixels: Int64[Tensor, "*batch"], times: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
+        """How many events each pixel fired at or before a time (ns), by binary search within the pixel."""
+        first, stop = self.offsets[pixels], self.offsets[pixels + 1]
+        following = first
+        steps = int(self.offsets.diff().max()).bit_length() if len(self) else 0
+        for step in reversed(range(steps)):
+            candidate = following + (1 << step)
+            passed = (candidate <= stop) & (self.times[(candidate - 1).clamp(max=len(self.times) - 1)] <= times)
+            following = torch.where(passed, candidate, following)
+        return following - first
+
+    def events(self, at_most: int | None = None) -> Events:
+        """The events in time order; of equal times, the lower pixel number first. Polarity is ±1.
+
+        Args:
+            at_most: Of more events than this, every second, third ... of each pixel is taken.
+        """
+        step = 1 if at_most is None else max(-(-len(self) // at_most), 1)
+        chosen = torch.arange(0, len(self), step, device=self.times.device)
+        pixels = torch.searchsorted(self.offsets, chosen, right=True) - 1
+        before = torch.where(chosen > 0, self.positives[chosen - 1], 0)
+        order = torch.argsort(self.times[chosen], stable=True)
+        p = (2 * (self.positives[chosen] - before) - 1)[order].to(torch.int8)
+        pixels = pixels[order]
+        x, y = pixels % self.width, pixels // self.width
+        x, y, p, t = (column.cpu().numpy() for column in (x, y, p, self.times[chosen][order]))
+        return Events(x.astype(np.uint16), y.astype(np.uint16), t, p)
 
 
-def _counting_sort(x, y, t, p, width, height):
-    offsets = np.zeros(width * height + 1, np.int64)
+def event_picture(index: EventIndex, camera: Camera, time: int) -> UInt8[np.ndarray, "height width 3"]:
+    """The pixels that fired last before an instant, on white: red where it became brighter, blue where darker.
+
+    Args:
+        index: On the CPU.
+        camera: Of the events.
+        time: Instant in ns.
+
+    Returns:
+        Undistorted picture of a fifth of the sensor's pixels at most.
+    """
+    pixels = torch.arange(camera.width * camera.height)
+    fired = index.count_until(pixels, torch.full_like(pixels, time))
+    pixels = pixels[fired > 0]
+    event = index.offsets[pixels] + fired[pixels] - 1
+    latest = index.times[event].topk(min(int(EVENTS_IN_PICTURE * camera.width * camera.height), len(event))).indices
+    pixels, event = pixels[latest], event[latest]
+    positive = index.positives[event] > torch.where(event > 0, index.positives[event - 1], 0)
+    picture = np.full((camera.height * camera.width, 3), 255, dtype=np.uint8)
+    picture[pixels] = np.where(positive[:, None], (205, 50, 50), (50, 70, 205))
+    return camera.undistort(picture.reshape(camera.height, camera.width, 3))
+
+
+@dataclass
+class Survey:
+    """What one pass over a recording's events finds out, before they are sorted."""
+
+    width: int
+    start: int
+    """Events before this time (ns) do not count."""
+    end: int
+    """Nor do events after this one."""
+    counts: Int32[np.ndarray, " pixels"]
+    """Events of each pixel from start to end."""
+    num_events: int = 0
+    """Of the whole recording."""
+    first: int = 0
+    """Time of the first event of the recording, ns."""
+    last: int = 0
+    """And of the last one."""
+    hot_pixels: Int64[np.ndarray, " hot"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Pixels that are left out, found by `leave_out_hot_pixels`; their counts are 0."""
+    num_hot_events: int = 0
+    """Events of these."""
+    outside: int | None = None
+    """The first event outside the sensor; the survey ends there, as with the next two."""
+    backwards: int | None = None
+    """The first event before its predecessor in time."""
+    odd_polarity: int | None = None
+    """The first event of a polarity that is neither of the two that the recording uses."""
+    odd_event: tuple[int, int, int, int] = (0, 0, 0, 0)
+    """x, y, t and p of the event at which the survey ended."""
+
+    @property
+    def offsets(self) -> Int64[Tensor, " pixels+1"]:
+        """Of an index of the events that count."""
+        offsets = np.zeros(len(self.counts) + 1, np.int64)
+        np.cumsum(self.counts, out=offsets[1:])
+        return torch.from_numpy(offsets)
+
+    def leave_out_hot_pixels(self, height: int) -> None:
+        """Find the pixels that fire far more often than their neighbourhood (5 x 5), and count none of their events."""
+        counts = self.counts.reshape(height, self.width)
+        usual = median_filter(counts, size=5, mode="nearest")
+        self.hot_pixels = np.flatnonzero(counts > HOT_RATIO * np.maximum(usual, HOT_FLOOR))
+        self.num_hot_events = int(self.counts[self.hot_pixels].sum())
+        self.counts[self.hot_pixels] = 0
+
+
+EventStream = Callable[[], Iterator[Events]]
+"""Starts again at the first event with every call, and gives the events in pieces."""
+
+
+def survey_events(stream: EventStream, width: int, height: int, start: int, end: int) -> Survey:
+    """Counts and checks the events of a recording, in one pass.
+
+    Args:
+        stream: The events, of polarity {0, 1} or ±1.
+        width, height: Of the sensor, pixels.
+        start, end: First and last time (ns) whose events count.
+    """
+    survey = Survey(width, start, end, np.zeros(width * height, np.int32))
+    state = np.zeros(3, np.int64)  # time of the latest event; whether polarity 0, and whether -1, was seen
+    state[0] = -(2**63)
+    scan = _compiled(_scan)
+    for events in stream():
+        x, y, p = _narrow(events.x), _narrow(events.y), _narrow(events.p)
+        fault, place = scan(x, y, events.t, p, width, height, start, end, survey.counts, state)
+        if survey.num_events == 0 and len(events):
+            survey.first = int(events.t[0])
+        if fault:
+            number = survey.num_events + place
+            survey.outside, survey.backwards, survey.odd_polarity = (number if fault == i else None for i in (1, 2, 3))
+            survey.odd_event = tuple(int(column[place]) for column in (events.x, events.y, events.t, events.p))
+            survey.last = int(state[0])
+            break
+        survey.num_events += len(events)
+    survey.last = int(state[0])
+    return survey
+
+
+def sorted_bands(
+    stream: EventStream, survey: Survey, max_events: int
+) -> Iterator[tuple[Int64[np.ndarray, " band"], Int32[np.ndarray, " band"]]]:
+    """The times and running counts of positives of an index, in bands of consecutive pixels: a counting sort.
+
+    Every band costs one pass over the events, and only one band is held in memory.
+
+    Args:
+        stream: The events that were surveyed.
+        survey: Without faults.
+        max_events: That a band may hold, unless one pixel has more.
+
+    Raises:
+        ValueError: The events are not those that were surveyed.
+    """
+    offsets = survey.offsets.numpy()
+    keep = np.ones(len(survey.counts), bool)
+    keep[survey.hot_pixels] = False
+    place = _compiled(_place)
+    first, num_positive = 0, np.int32(0)
+    while first < len(survey.counts):
+        stop = max(int(np.searchsorted(offsets, offsets[first] + max_events, side="right")) - 1, first + 1)
+        band = offsets[first : stop + 1]
+        filled = np.zeros(stop - first, np.int32)
+        times, positives = np.empty(band[-1] - band[0], np.int64), np.empty(band[-1] - band[0], np.int32)
+        for events in stream():
+            x, y, p = _narrow(events.x), _narrow(events.y), _narrow(events.p)
+            limits = survey.width, survey.start, survey.end, first, stop
+            if not place(x, y, events.t, p, *limits, keep, band, filled, times, positives):
+                raise ValueError("changed while it was read")
+        if filled.sum() != len(times):
+            raise ValueError("changed while it was read")
+        if len(positives):
+            positives[0] += num_positive
+            np.cumsum(positives, out=positives)
+            num_positive = positives[-1]
+        yield times, positives
+        first = stop
+
+
+def with_progress(stream: EventStream, num_events: int | None) -> EventStream:
+    """The same events; a progress bar shows how many of them have passed, once that takes long.
+
+    Args:
+        stream: To be called several times.
+        num_events: How many there are, where that is known.
+    """
+
+    def watched() -> Iterator[Events]:
+        columns = (TextColumn("Indexing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
+        progress = Progress(*columns, transient=True)
+        task = progress.add_task("", total=num_events)
+        begin = time.monotonic()
+        try:
+            for events in stream():
+                yield events
+                progress.advance(task, len(events))
+                if time.monotonic() - begin > SILENT_SECONDS:
+                    progress.start()  # nothing, once it has started
+        finally:
+            if progress.live.is_started:
+                progress.stop()
+
+    return watched
+
+
+def _narrow(column: Int[np.ndarray, " events"]) -> np.ndarray:
+    """As int32, so that the compiled loops meet one type; what is too large stays too large."""
+    if column.dtype.itemsize < 4 or column.dtype == np.int32:
+        return column.astype(np.int32, copy=False)
+    limits = np.iinfo(np.int32)
+    return np.clip(column, max(limits.min, np.iinfo(column.dtype).min), limits.max).astype(np.int32)
+
+
+def _scan(x, y, t, p, width, height, start, end, counts, state):
+    """Adds events to the counts, and returns the kind and place of the first fault, or (0, 0)."""
     for i in range(len(t)):
-        offsets[np.int64(y[i]) * width + x[i] + 1] += 1
-    for pixel in range(width * height):
-        offsets[pixel + 1] += offsets[pixel]
-    free = offsets[:-1].copy()
-    times = np.empty(len(t), np.int64)
-    positives = np.empty(len(t), np.int32)
+        if x[i] < 0 or x[i] >= width or y[i] < 0 or y[i] >= height:
+            return 1, i
+        if t[i] < state[0]:
+            return 2, i
+        state[0] = t[i]
+        if p[i] == 0:
+            state[1] = 1
+        elif p[i] == -1:
+            state[2] = 1
+        elif p[i] != 1:
+            return 3, i
+        if state[1] and state[2]:
+            return 3, i
+        if start <= t[i] <= end:
+            counts[np.int64(y[i]) * width + x[i]] += 1
+    return 0, 0
+
+
+def _place(x, y, t, p, width, start, end, first, stop, keep, offsets, filled, times, positives):
+    """Puts the events of a band of pixels at their places; False where there are more than were counted."""
     for i in range(len(t)):
         pixel = np.int64(y[i]) * width + x[i]
-        times[free[pixel]] = t[i]
-        positives[free[pixel]] = p[i] > 0
-        free[pixel] += 1
-    for i in range(1, len(t)):
-        positives[i] += positives[i - 1]
-    return times, positives, offsets
+        if first <= pixel < stop and keep[pixel] and start <= t[i] <= end:
+            slot = offsets[pixel - first] + filled[pixel - first]
+            if slot >= offsets[pixel - first + 1]:
+                return False
+            times[slot - offsets[0]] = t[i]
+            positives[slot - offsets[0]] = p[i] > 0
+            filled[pixel - first] += 1
+    return True
 
 
 @cache
-def _compiled_counting_sort():
+def _compiled(function):
     import numba  # here, since importing it takes longer than reading a small recording
 
-    return numba.njit(_counting_sort)
+    try:
+        return numba.njit(cache=True)(function)
+    except RuntimeError:  # there is no folder to write the cache to
+        return numba.njit(function)

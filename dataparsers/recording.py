@@ -1,14 +1,15 @@
 """A recording of an event camera, whatever format it was read from: events, frames, cameras and poses on one clock.
 
 A format is a module with `FILES`, the glob patterns that its folders are recognised by, and `read(folder)`; adding one
-means writing that module and naming it in `read_recording`.
+means writing that module and naming it in `FORMATS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,17 @@ from PIL import Image
 
 if TYPE_CHECKING:
     from enerf_ns.dataparsers.calibration import Camera
+    from enerf_ns.dataparsers.events import EventIndex, Survey
     from enerf_ns.dataparsers.trajectory import Trajectory
+
+EVENTS_AT_A_TIME = 2**18
+"""Events that readers hand on at once: enough for speed, few enough to need hardly any memory."""
+
+LARGEST_RATE = 2e9
+"""Events per second that no sensor can send; more of them means that times are in another unit than was thought."""
+
+LARGEST_SPAN_RATIO = 300
+"""Between the spans of events and poses; units of time differ by 1000."""
 
 
 class RecordingError(ValueError):
@@ -30,13 +41,13 @@ class Events:
     """Brightness changes in time order, one array a column."""
 
     x: Int[np.ndarray, " events"]
-    """Columns, uint16."""
+    """Columns, of any integer type."""
     y: Int[np.ndarray, " events"]
-    """Rows, uint16."""
+    """Rows, of any integer type."""
     t: Int64[np.ndarray, " events"]
     """Nanoseconds, never decreasing."""
     p: Int[np.ndarray, " events"]
-    """Polarity, int8: +1 where it became brighter, -1 where it became darker."""
+    """Polarity: 1 where it became brighter; where it became darker, -1, or 0 or false as some formats write."""
 
     def __len__(self) -> int:
         return len(self.t)
@@ -54,6 +65,12 @@ class Frames:
     """Of the camera of the frames."""
     depth_filenames: tuple[Path, ...] | None = None
     """.npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was hit."""
+    numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Of each frame in its folder, from 0; counted here unless given."""
+
+    def __post_init__(self) -> None:
+        if not len(self.numbers):
+            object.__setattr__(self, "numbers", np.arange(len(self.times)))
 
     def subset(self, indices: Int[np.ndarray, " chosen"]) -> Frames:
         """The frames at the given indices only."""
@@ -63,12 +80,13 @@ class Frames:
             filenames=tuple(self.filenames[i] for i in indices),
             times=self.times[indices],
             depth_filenames=depth,
+            numbers=self.numbers[indices],
         )
 
 
 @dataclass(eq=False)
 class EventRecording:
-    """What a reader found in a folder. Frames outside the poses are dropped at once, events when they are read."""
+    """What a reader found in a folder. Frames outside the poses are dropped at once, events when they are indexed."""
 
     path: Path
     format: str
@@ -76,24 +94,67 @@ class EventRecording:
     """Of the events."""
     trajectory: Trajectory
     """Of the event camera."""
-    load_events: Callable[[], Events]
-    """Reads the events as they are in the files: columns of any integer type, polarity {0, 1} or ±1 or bool."""
+    stream_events: Callable[[], Iterator[Events]]
+    """Reads the events as they are in the files, in pieces of at most about `EVENTS_AT_A_TIME`. Every call starts again
+    and gives the same events, whatever a file has grown by since the reader looked at it."""
+    event_files: tuple[Path, ...]
+    """All files that the events come from."""
     frames: Frames | None = None
     """Sharp frames."""
     blurred_frames: Frames | None = None
     """The same instants, blurred by motion."""
+    held_out_frames: Frames | None = None
+    """Views for evaluation alone, on a trajectory and a clock of their own."""
     contrast_thresholds: tuple[float, float] | None = None
     """Of on and of off events, above 0, where the recording knows them."""
+    refractory_period: int = 0
+    """For how long a pixel is blind after an event, ns."""
+    bayer_pattern: str | None = None
+    """Colours of the sensor's pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; None: a grey sensor."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest depth in metres, where the recording knows them."""
     notes: list[str] = field(default_factory=list)
     """What was dropped or renormalised, one sentence each."""
     locate_event: Callable[[int], str] | None = None
-    """File and line of event number i of `load_events`, for error messages."""
+    """File and line of event number i of the stream, for error messages."""
+    num_events: int | None = None
+    """In the files, where that is known before they are read; for progress alone."""
+    time_range: tuple[int, int] | None = None
+    """First and last time (ns) of what is used of the recording; set by `select`."""
+    keep_hot_pixels: bool = False
+    """Whether pixels that fire far more often than their neighbourhood are used; set by `select`."""
 
     def __post_init__(self) -> None:
+        states = [(file.resolve(), file.stat()) for file in self.event_files]
+        self._source = [(str(path), state.st_size, state.st_mtime_ns) for path, state in states]
         self.frames = self._covered(self.frames, "frames")
         self.blurred_frames = self._covered(self.blurred_frames, "blurred frames")
+
+    def select(self, time_range: tuple[float, float] | None, keep_hot_pixels: bool) -> None:
+        """Which part of the events is used.
+
+        Args:
+            time_range: First and last time in seconds on the recording's clock, or None for all.
+            keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
+
+        Raises:
+            RecordingError: The range holds no poses.
+        """
+        self.keep_hot_pixels = keep_hot_pixels
+        if time_range is not None:
+            self.time_range = round(time_range[0] * 1e9), round(time_range[1] * 1e9)
+            start, end = self.span
+            if not start < end:
+                raise RecordingError(
+                    f"--time-range {time_range[0]:g} {time_range[1]:g} (seconds) holds none of the poses of "
+                    f"{self.path}, which lie from {_seconds(self.trajectory.start)} to {_seconds(self.trajectory.end)}."
+                )
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last time (ns) that is used: of the poses, within the range that was selected."""
+        start, end = self.time_range or (self.trajectory.start, self.trajectory.end)
+        return max(start, self.trajectory.start), min(end, self.trajectory.end)
 
     @property
     def has_frames(self) -> bool:
@@ -105,60 +166,102 @@ class EventRecording:
         return self
 
     @cached_property
-    def events(self) -> Events:
-        """All events between the first and the last pose, checked; polarity ±1. Read at first access.
+    def index(self) -> EventIndex:
+        """All events of the span, checked and sorted by pixel. Made, or found in the cache, at first access.
 
         Raises:
-            RecordingError: No events, a coordinate outside the sensor, time that goes backwards, a polarity other than
-                {0, 1} or ±1, no events within the poses, or fewer than two events at every pixel.
+            RecordingError: No events, a coordinate outside the sensor, time that goes backwards, times in another unit
+                than those of the poses, a polarity other than {0, 1} or ±1, no events within the poses, or fewer than
+                two events at every pixel.
         """
-        events = self.load_events()
-        self._check(events)
-        start, end = self.trajectory.start, self.trajectory.end
-        kept = slice(np.searchsorted(events.t, start, side="left"), np.searchsorted(events.t, end, side="right"))
-        x = events.x[kept].astype(np.uint16, copy=False)
-        y = events.y[kept].astype(np.uint16, copy=False)
-        t, p = events.t[kept], (events.p[kept] > 0).view(np.int8) * np.int8(2) - np.int8(1)
-        if len(t) == 0:
-            raise RecordingError(
-                f"The poses of {self.path} do not cover the events, which lie from {_seconds(events.t[0])} to "
-                f"{_seconds(events.t[-1])} while the poses lie from {_seconds(start)} to {_seconds(end)}; both must be "
-                "on one clock."
-            )
-        self._note_dropped(len(events) - len(t), len(events), "events")
-        if np.bincount(y * np.int64(self.camera.width) + x).max() < 2:
-            raise RecordingError(
-                f"{self.path} holds {len(t):,} events within the poses and never two at one pixel, but learning needs "
-                "pixels with at least two; give a longer recording."
-            )
-        return Events(x, y, t, p)
+        from enerf_ns.dataparsers.events import survey_events, with_progress  # here, since it imports this module
+        from enerf_ns.dataparsers.index_cache import build_index, entry_name, load_index
 
-    def _check(self, events: Events) -> None:
-        if len(events) == 0:
+        camera, (start, end) = self.camera, self.span
+        first = next((int(events.t[0]) for events in self.stream_events() if len(events)), None)
+        if first is None:
             raise RecordingError(f"{self.path} holds no events; give a recording with some.")
-        for name, column, size in (("x", events.x, self.camera.width), ("y", events.y, self.camera.height)):
-            if column.min() < 0 or column.max() >= size:
-                bad = int(np.argmax((column < 0) | (column >= size)))
+        name = entry_name(
+            format=self.format,
+            files=self._source,
+            first=first,
+            sensor=[camera.width, camera.height],
+            span=[start, end],
+            keep_hot_pixels=self.keep_hot_pixels,
+        )
+        loaded = load_index(name)
+        if loaded is not None:
+            index, survey = loaded
+        else:
+            stream = with_progress(self.stream_events, self.num_events)
+            survey = survey_events(stream, camera.width, camera.height, start, end)
+            self._check(survey)
+            if not self.keep_hot_pixels:
+                survey.leave_out_hot_pixels(camera.height)
+            try:
+                index = build_index(stream, survey, name, self.notes)
+            except ValueError as error:
+                raise RecordingError(f"{self.path} {error}; wait until it is written, then read it again.") from error
+            except OSError as error:
                 raise RecordingError(
-                    f"{self._locate(bad)} holds {name} = {column[bad]}, which lies outside the sensor of "
-                    f"{self.camera.width} x {self.camera.height} pixels ({name} from 0 to {size - 1})."
-                )
-        backwards = events.t[1:] < events.t[:-1]
-        if backwards.any():
-            bad = int(np.argmax(backwards)) + 1
+                    f"{self.path} holds {survey.counts.sum():,} events, more than fit into a quarter of the memory, "
+                    f"and their index cannot be stored ({error}); make room, set ENERF_CACHE to another folder, or "
+                    "use less of the recording with --time-range."
+                ) from error
+        self._note_events(survey)
+        return index
+
+    def _check(self, survey: Survey) -> None:
+        x, y, t, p = survey.odd_event
+        if survey.outside is not None:
+            name, value, size = ("x", x, survey.width) if not 0 <= x < survey.width else ("y", y, self.camera.height)
             raise RecordingError(
-                f"{self._locate(bad)} goes back in time from {_seconds(events.t[bad - 1])} to {_seconds(events.t[bad])}"
-                ", but events must be in time order; sort them."
+                f"{self._locate(survey.outside)} holds {name} = {value}, which lies outside the sensor of "
+                f"{self.camera.width} x {self.camera.height} pixels ({name} from 0 to {size - 1})."
             )
-        polarities = events.p.view(np.int8) if events.p.dtype == bool else events.p
-        bad = (polarities < -1) | (polarities > 1) if polarities.min() < -1 or polarities.max() > 1 else np.array([])
-        if polarities.min() == -1 and not bad.any():
-            bad = polarities == 0
-        if bad.any():
-            index = int(np.argmax(bad))
+        if survey.backwards is not None:
             raise RecordingError(
-                f"{self._locate(index)} holds polarity {polarities[index]}, but a recording's polarities must all be 0 "
+                f"{self._locate(survey.backwards)} goes back in time from {_seconds(survey.last)} to {_seconds(t)}, "
+                "but events must be in time order; sort them."
+            )
+        if survey.odd_polarity is not None:
+            raise RecordingError(
+                f"{self._locate(survey.odd_polarity)} holds polarity {p}, but a recording's polarities must all be 0 "
                 "or 1, or all be -1 or 1."
+            )
+        span, poses = (survey.last - survey.first) * 1e-9, (self.trajectory.end - self.trajectory.start) * 1e-9
+        if survey.num_events >= 1000 and (
+            survey.num_events > LARGEST_RATE * span or not 1 / LARGEST_SPAN_RATIO < span / poses < LARGEST_SPAN_RATIO
+        ):
+            raise RecordingError(
+                f"{self.path} holds {survey.num_events:,} events within {span:.6g} s and poses within {poses:.6g} s, "
+                "which does not fit together; state the times of both in the unit that the format asks for."
+            )
+        if not survey.counts.any():
+            raise RecordingError(
+                f"The poses of {self.path} do not cover the events, which lie from {_seconds(survey.first)} to "
+                f"{_seconds(survey.last)} while the poses{' in the time range' * bool(self.time_range)} lie from "
+                f"{_seconds(survey.start)} to {_seconds(survey.end)}; both must be on one clock."
+            )
+        if survey.counts.max() < 2:
+            raise RecordingError(
+                f"{self.path} holds {survey.counts.sum():,} events within the poses and never two at one pixel, but "
+                "learning needs pixels with at least two; give a longer recording."
+            )
+        if survey.counts.sum() >= 2**31:
+            raise RecordingError(
+                f"{self.path} holds {survey.counts.sum():,} events, but an index holds fewer than 2^31; use less of "
+                "the recording with --time-range."
+            )
+
+    def _note_events(self, survey: Survey) -> None:
+        used = int(survey.counts.sum())
+        if self.time_range is None:
+            self._note_dropped(survey.num_events - survey.num_hot_events - used, survey.num_events, "events")
+        if len(survey.hot_pixels):
+            self.notes.append(
+                f"{len(survey.hot_pixels):,} hot pixels, which fire over 10 times as often as their neighbourhood, are "
+                f"left out with {survey.num_hot_events:,} events; --keep-hot-pixels True keeps them."
             )
 
     def _locate(self, index: int) -> str:
@@ -177,35 +280,52 @@ class EventRecording:
             self.notes.append(f"{dropped:,} of {total:,} {what} ({share}) lie outside the poses and are left out.")
 
 
-def read_recording(path: Path | str, format: str = "auto") -> EventRecording:
+def read_recording(
+    path: Path | str,
+    format: str = "auto",
+    time_range: tuple[float, float] | None = None,
+    keep_hot_pixels: bool = False,
+    **options: object,
+) -> EventRecording:
     """Reads a recording; its events are read when first asked for. A folder is read once per process.
 
     Args:
         path: Folder of the recording; never written to.
-        format: "esim", "davis", or "auto" to find out.
+        format: A name of `FORMATS`, or "auto" to find out.
+        time_range: As of `EventRecording.select`.
+        keep_hot_pixels: As of `EventRecording.select`.
+        options: Of the format's reader.
 
     Raises:
         RecordingError: The folder is of no known format, or anything in it cannot be used.
     """
-    return _read_recording(Path(path).resolve(), format)
+    return _read_recording(Path(path).resolve(), format, time_range, keep_hot_pixels, **options)
+
+
+FORMATS = ("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "event_recording")
+"""Names of the formats, which are those of their readers' modules."""
 
 
 @cache
-def _read_recording(path: Path, format: str) -> EventRecording:
-    from enerf_ns.dataparsers import davis, esim  # here, since they import this module
-
-    formats = {"esim": esim, "davis": davis}
+def _read_recording(path: Path, format: str, time_range, keep_hot_pixels: bool, **options: object) -> EventRecording:
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give the folder of a recording.")
     if not path.is_dir():
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
-    if format != "auto":
-        return formats[format].read(path)
-    found = {name: sum(any(path.glob(pattern)) for pattern in reader.FILES) for name, reader in formats.items()}
+    reader = import_module(f"enerf_ns.dataparsers.{_find_format(path) if format == 'auto' else format}")
+    recording = reader.read(path, **options)
+    recording.select(time_range, keep_hot_pixels)
+    return recording
+
+
+def _find_format(path: Path) -> str:
+    """Of the formats, the one most of whose files lie in a folder."""
+    readers = {name: import_module(f"enerf_ns.dataparsers.{name}") for name in FORMATS}
+    found = {name: sum(any(path.glob(pattern)) for pattern in reader.FILES) for name, reader in readers.items()}
     best = [name for name, count in found.items() if count == max(found.values())]
     if len(best) == 1:
-        return formats[best[0]].read(path)
-    looked_for = "; ".join(f"for {name}: {', '.join(reader.FILES)}" for name, reader in formats.items())
+        return best[0]
+    looked_for = "; ".join(f"for {name}: {', '.join(reader.FILES)}" for name, reader in readers.items())
     names = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     listed = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     raise RecordingError(

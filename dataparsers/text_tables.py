@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.recording import RecordingError
 
-NANOSECONDS = {"s": Decimal(10) ** 9, "ns": Decimal(1)}
+NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 
 QUATERNION_TOLERANCE = 1e-3
 """Largest error of a quaternion's norm that is renormalised."""
@@ -54,7 +54,7 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
 
 
 def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> Int64[np.ndarray, " rows"]:
-    """Nanoseconds from decimal text in seconds ("s") or nanoseconds ("ns"), exact for numbers of any length.
+    """Nanoseconds from decimal text in seconds ("s"), microseconds ("us") or nanoseconds ("ns"), exact at any length.
 
     Raises:
         RecordingError: A cell is no number, or a time does not lie after the one before it.
@@ -104,7 +104,7 @@ def read_poses(
 
     Args:
         path: The file.
-        unit: Of the times, "s" or "ns".
+        unit: Of the times, "s", "us" or "ns".
         notes: Gets a sentence if quaternions had to be renormalised.
 
     Returns:

@@ -59,6 +59,17 @@ class Trajectory:
             )
         }
 
+    def of_mounted(self, body_from_camera: Float64[np.ndarray, "4 4"]) -> Trajectory:
+        """The trajectory of a camera that is fixed to this body.
+
+        Args:
+            body_from_camera: Pose of the camera in the axes of the body, metres: the extrinsics.
+        """
+        bodies, mount = Rotation.from_quat(self.quaternions), Rotation.from_matrix(body_from_camera[:3, :3])
+        return Trajectory(
+            self.times, self.positions + bodies.apply(body_from_camera[:3, 3]), (bodies * mount).as_quat()
+        )
+
     def covers(self, times: Int64[Tensor | np.ndarray, "*batch"]) -> Bool[Tensor | np.ndarray, "*batch"]:
         """Which times (ns) lie between the first and the last pose, both included."""
         return (times >= self.start) & (times <= self.end)

@@ -17,8 +17,8 @@ from tyro.conf import OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
-from enerf_ns.dataparsers.events import EventIndex
 from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.event_camera import color_channels
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.event_sampler import EventPairSampler, SilentPixelSampler
 from enerf_ns.ray_samplers import PairedRayBundle
@@ -82,7 +82,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def setup_events(self, recording: EventRecording) -> None:
         """Index the events on the device, and what turns pixels and times into rays."""
         config, camera = self.config, recording.camera
-        index = EventIndex.from_events(recording.events, camera.width, camera.height).to(self.device)
+        index = recording.index.to(self.device)
         self.silent_sampler = None
         try:
             self.pair_sampler = EventPairSampler(
@@ -91,11 +91,14 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 max_distance=config.max_pair_distance,
                 window_ns=round(config.window_ms * 1e6),
                 uniform_over=config.uniform_over,
+                refractory_ns=recording.refractory_period,
             )
             if config.silent_pairs:
-                first, last = recording.events.t[[0, -1]].tolist()
+                first, last = recording.index.span
                 silence = round(config.silence_ms * 1e6)
-                self.silent_sampler = SilentPixelSampler(index, first, last, silence, silence)
+                self.silent_sampler = SilentPixelSampler(
+                    index, first, last, silence, silence, recording.refractory_period
+                )
         except ValueError as error:
             raise SystemExit(f"enerf: {recording.path}: {error}") from error
         directions = camera.pixel_directions().reshape(-1, 3)
@@ -103,6 +106,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         self.pixel_directions = torch.from_numpy(directions / norm).float().to(self.device)
         self.pixel_directions_norm = torch.from_numpy(norm).float().to(self.device)
         self.pixel_area = 1.0 / (camera.fx * camera.fy)
+        self.pixel_channels = None
+        if recording.bayer_pattern is not None:
+            channels = color_channels(recording.bayer_pattern, camera.width, camera.height)
+            self.pixel_channels = channels.to(self.device)
         self.trajectory = recording.trajectory
 
     def setup_eval(self) -> None:
@@ -119,8 +126,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         Returns:
             Rays in the order of `PairedRayBundle`, event pairs before silent ones, and a batch of: `num_pairs`, event
             pairs and silent ones; `on` and `off` (event pairs,), the numbers of events of each polarity between the
-            two instants; `image` (frame rays, 3) in [0, 1] where the field learns from frames. A loaded run, which is
-            not training, draws pixels evenly from its cameras.
+            two instants; `channel` (pairs,), the colour channel that the pixel sees, where the sensor has a colour
+            filter; `image` (frame rays, 3) in [0, 1] where the field learns from frames. A loaded run, which is not
+            training, draws pixels evenly from its cameras.
         """
         self.train_count += 1
         if self.test_mode != "val":
@@ -138,6 +146,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 pixels = torch.cat([pixels, silent.pixels])
                 start, end = torch.cat([start, silent.start]), torch.cat([end, silent.end])
             num_pairs = len(pixels)
+            if self.pixel_channels is not None:
+                batch["channel"] = self.pixel_channels[pixels]
             bundles.append(self.event_rays(pixels.repeat(2), torch.cat([start, end])))
         if self.frame_colors is not None:
             rays, frame_batch = self.frame_rays(self.config.train_num_rays_per_batch)

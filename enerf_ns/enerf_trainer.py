@@ -44,7 +44,7 @@ class EnerfTrainerConfig(TrainerConfig):
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         recording = EventDataParser(manager.dataparser).recording()
         choices = fill_in_choices(self.pipeline, recording)
-        recording.events  # noqa: B018 - reads and checks them
+        recording.index  # noqa: B018 - reads and checks the events
         return recording, choices
 
     def save_config(self) -> None:
@@ -84,16 +84,17 @@ class EnerfTrainer(Trainer):
 
 def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Table:
     """What the recording holds."""
-    events, camera = recording.events, recording.camera
-    seconds = max(int(events.t[-1] - events.t[0]), 1) * 1e-9
-    on = float((events.p > 0).mean())
-    depth = config.pipeline.datamanager.dataparser.depth_range
+    index, camera = recording.index, recording.camera
+    first, last = index.span
+    seconds = max(last - first, 1) * 1e-9
+    parser = config.pipeline.datamanager.dataparser
+    depth = parser.depth_range
     rows = {
         "folder": f"{recording.path} ({recording.format})",
-        "events": f"{len(events):,}, {100 * on:.0f} % on",
+        "events": f"{len(index):,}, {100 * index.num_positive / len(index):.0f} % on",
         "span": f"{seconds:.2f} s",
-        "rate": f"{len(events) / seconds / 1e6:.2f} million events/s, "
-        f"{len(events) / (camera.width * camera.height):.1f} a pixel",
+        "rate": f"{len(index) / seconds / 1e6:.2f} million events/s, "
+        f"{len(index) / (camera.width * camera.height):.1f} a pixel",
         "sensor": f"{camera.width} x {camera.height}, {camera.model}",
         "poses": f"{len(recording.trajectory.times):,}",
     }
@@ -104,7 +105,7 @@ def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Ta
         depth_note = ", with depth" if frames.depth_filenames else ""
         rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
     if depth is not None:
-        _, scale, box = scene_normalisation(recording, *depth)
+        _, scale, box = scene_normalisation(recording, *depth, parser.box)
         rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
         rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
     table = Table(title="Recording", show_header=False, title_justify="left")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 LINEAR_UNTIL = 20.0
@@ -44,6 +44,30 @@ def luma(rgb: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch"]:
     if rgb.shape[-1] == 1:
         return rgb[..., 0]
     return rgb @ rgb.new_tensor([0.299, 0.587, 0.114])
+
+
+def color_channels(pattern: str, width: int, height: int) -> Int64[Tensor, " pixels"]:
+    """Colour channel, 0, 1 or 2, that each pixel of a sensor with a colour filter sees, by pixel number.
+
+    Args:
+        pattern: Letters R, G and B of the pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; the filter
+            repeats them.
+        width, height: Of the sensor, pixels.
+
+    Raises:
+        ValueError: The pattern is not four of these letters.
+    """
+    if len(pattern) != 4 or not set(pattern) <= set("RGB"):
+        raise ValueError(f"A colour filter is four letters of R, G and B, such as RGGB, not {pattern!r}.")
+    tile = torch.tensor(["RGB".index(letter) for letter in pattern]).reshape(2, 2)
+    return tile.repeat(-(-height // 2), -(-width // 2))[:height, :width].flatten()
+
+
+def pixel_brightness(
+    rgb: Float[Tensor, "*batch 3"], channel: Int64[Tensor, "*batch"] | None
+) -> Float[Tensor, "*batch"]:
+    """Brightness that pixels see of three colour channels: each its own channel, or luma where that is None."""
+    return luma(rgb) if channel is None else rgb.gather(-1, channel[..., None])[..., 0]
 
 
 def measured_change(

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.events import EventIndex
 
+CHUNK = 2**20
+"""Events looked at together while the pairs are counted, so that this needs little memory beside the index."""
+
 
 @dataclass(frozen=True)
 class EventPairs:
-    """A batch of pixels, each with two instants and the events that it fired after the first, up to the second."""
+    """A batch of pixels, each with two instants and the events that it fired between them, the second included."""
 
     pixels: Int64[Tensor, " batch"]
     """y * width + x"""
@@ -23,9 +26,9 @@ class EventPairs:
     end: Int64[Tensor, " batch"]
     """Second instant, ns; later than the first."""
     on: Int64[Tensor, " batch"]
-    """Number of positive events in (start, end]."""
+    """Number of positive events."""
     off: Int64[Tensor, " batch"]
-    """Number of negative events in (start, end]."""
+    """Number of negative events."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -42,6 +45,11 @@ class EventPairSampler:
     * window: time is cut into windows of `window_ns` from the first event on, and the pair is (i, last instant of this
       pixel in the same window), the 60 ms ablation of E-NeRF.
 
+    After an event a pixel is blind for the refractory period, and then compares brightness with what it sees first
+    (Robust e-NeRF, ICCV 2023): the interval that a pair measures begins that much after its first event, but at least
+    1 ns before its last one. This is exact for pairs of successors. Between the events of other pairs the pixel is
+    blind too, and what changes meanwhile is missing from the sum of their events: these pairs are approximate.
+
     Args:
         index: The events; batches come out on its device.
         mode: Which pairs there are.
@@ -49,6 +57,7 @@ class EventPairSampler:
         window_ns: For mode window, at least 1.
         uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are, and so
             are all pairs of a pixel.
+        refractory_ns: Refractory period of the pixels, 0 for none.
 
     Raises:
         ValueError: There is no pair to draw, or an argument is outside its range.
@@ -61,6 +70,7 @@ class EventPairSampler:
         max_distance: int = 30,
         window_ns: int = 60_000_000,
         uniform_over: Literal["pairs", "pixels"] = "pairs",
+        refractory_ns: int = 0,
     ):
         if max_distance < 1 or window_ns < 1:
             raise ValueError(
@@ -69,16 +79,18 @@ class EventPairSampler:
         self.index = index
         self.window = mode == "window"
         self.max_distance = 1 if mode == "successor" else max_distance
+        self.refractory_ns = refractory_ns
 
-        instants = _last_of_each(index, index.times)
+        instants = _last_of_each(index)
         if self.window:
-            first = index.times.min() if len(index.times) else 0
-            lasts = _last_of_each(index, (index.times - first) // window_ns)
-            self._starts = (instants & ~lasts).nonzero()[:, 0].int()
-            self._lasts = lasts.nonzero()[:, 0].int()
+            lasts = _last_of_each(index, window_ns)
+            instants &= ~lasts
+            self._lasts = _places(lasts)
+            del lasts  # it takes a byte an event
+            self._starts = _places(instants)
             self._pair_offsets = torch.searchsorted(self._starts, index.offsets.int()).long()
         else:
-            self._instants = None if instants.all() else instants.nonzero()[:, 0].int()
+            self._instants = None if instants.all() else _places(instants)
             self._offsets = (
                 index.offsets
                 if self._instants is None
@@ -106,7 +118,9 @@ class EventPairSampler:
             pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
         start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
         on = (self.index.positives[end] - self.index.positives[start]).long()
-        return EventPairs(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
+        end_time = self.index.times[end]
+        start_time = torch.minimum(self.index.times[start] + self.refractory_ns, end_time - 1)
+        return EventPairs(pixels, start_time, end_time, on, end - start - on)
 
     def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         start = self._starts[pair]
@@ -134,15 +148,17 @@ class EventPairSampler:
 class SilentPixelSampler:
     """Draws pixels and two instants between which they fired nothing, for the no-event loss of E-NeRF.
 
-    A pixel is drawn uniformly over the sensor and an instant uniformly over the recording; the silent interval around
-    it is bounded by the pixel's neighbouring events, or the recording's ends. From an interval at least
-    `min_duration_ns` long, two instants are drawn uniformly, at most `max_duration_ns` apart and never at an event.
+    A pixel is drawn uniformly over the sensor, hot pixels left out, and an instant uniformly over the recording; the
+    silent interval around it is bounded by the pixel's neighbouring events, or the recording's ends, and begins when
+    the pixel can see again. From an interval at least `min_duration_ns` long, two instants are drawn uniformly, at most
+    `max_duration_ns` apart and never at an event.
 
     Args:
         index: The events; batches come out on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         min_duration_ns: At least 1.
         max_duration_ns: At least 2.
+        refractory_ns: For how long a pixel is blind after an event.
 
     Raises:
         ValueError: A duration is shorter than that.
@@ -150,7 +166,15 @@ class SilentPixelSampler:
 
     ROUNDS = 32
 
-    def __init__(self, index: EventIndex, start_ns: int, end_ns: int, min_duration_ns: int, max_duration_ns: int):
+    def __init__(
+        self,
+        index: EventIndex,
+        start_ns: int,
+        end_ns: int,
+        min_duration_ns: int,
+        max_duration_ns: int,
+        refractory_ns: int = 0,
+    ):
         if min_duration_ns < 1 or max_duration_ns < 2:
             raise ValueError(
                 "Silent pixels need min_duration_ns of at least 1 and max_duration_ns of at least 2, "
@@ -159,7 +183,10 @@ class SilentPixelSampler:
         self.index = index
         self.start_ns, self.end_ns = start_ns, end_ns
         self.min_duration_ns, self.max_duration_ns = min_duration_ns, max_duration_ns
-        self._search_steps = int(index.offsets.diff().max()).bit_length()
+        self.blind_ns = max(refractory_ns, 1)
+        usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
+        usable[index.hot_pixels] = False
+        self._pixels = usable.nonzero()[:, 0]
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventPairs:
         """Draws `batch_size` silent pairs (on = off = 0); the generator lives on the device of the index.
@@ -186,31 +213,44 @@ class SilentPixelSampler:
     def _silent_intervals(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""
         times, offsets = self.index.times, self.index.offsets
-        pixels = torch.randint(len(offsets) - 1, (draws,), generator=generator, device=times.device)
+        chosen = torch.randint(len(self._pixels), (draws,), generator=generator, device=times.device)
+        pixels = self._pixels[chosen]
         instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=times.device)
         first, stop = offsets[pixels], offsets[pixels + 1]
-        following = first
-        for step in reversed(range(self._search_steps)):
-            candidate = following + (1 << step)
-            passed = (candidate <= stop) & (times[(candidate - 1).clamp(max=len(times) - 1)] <= instant)
-            following = torch.where(passed, candidate, following)
+        following = first + self.index.count_until(pixels, instant)
         previous_time = times[(following - 1).clamp(min=0)]
         following_time = times[following.clamp(max=len(times) - 1)]
-        begin = torch.where(following > first, previous_time + 1, self.start_ns).clamp(min=self.start_ns)
+        begin = torch.where(following > first, previous_time + self.blind_ns, self.start_ns).clamp(min=self.start_ns)
         end = torch.where(following < stop, following_time - 1, self.end_ns).clamp(max=self.end_ns)
-        long_enough = end - begin >= self.min_duration_ns
-        instant = torch.maximum(instant, begin)
+        usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
         end = torch.minimum(end, instant + self.max_duration_ns // 2)
-        return pixels[long_enough], begin[long_enough], end[long_enough]
+        return pixels[usable], begin[usable], end[usable]
 
 
-def _last_of_each(index: EventIndex, values: Tensor) -> Tensor:
-    """Whether each event is the last of its pixel with this value; values never decrease within a pixel."""
-    last = torch.ones(len(values), dtype=torch.bool, device=values.device)
-    last[:-1] = values[1:] != values[:-1]
+def _last_of_each(index: EventIndex, window_ns: int | None = None) -> Bool[Tensor, " events"]:
+    """Whether each event is the last of its pixel at this time, or in its window of time since the first event."""
+    times = index.times
+    origin = index.span[0] if window_ns is not None and len(times) else 0
+    last = torch.ones(len(times), dtype=torch.bool, device=times.device)
+    for first in range(0, len(times) - 1, CHUNK):
+        values = times[first : first + CHUNK + 1]
+        if window_ns is not None:
+            values = (values - origin) // window_ns
+        last[first : first + CHUNK][: len(values) - 1] = values[1:] != values[:-1]
     last[index.offsets[1:][index.offsets.diff() > 0] - 1] = True
     return last
+
+
+def _places(chosen: Bool[Tensor, " events"]) -> Int32[Tensor, " chosen"]:
+    """Numbers of the events that are chosen."""
+    places = torch.empty(int(chosen.count_nonzero()), dtype=torch.int32, device=chosen.device)
+    filled = 0
+    for first in range(0, len(chosen), CHUNK):
+        found = chosen[first : first + CHUNK].nonzero()[:, 0] + first
+        places[filled : filled + len(found)] = found
+        filled += len(found)
+    return places
 
 
 def _randint(high: Tensor, generator: torch.Generator) -> Tensor:

@@ -69,7 +69,12 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
             "partner": f"each event with one of the pixel's next {data.max_pair_distance}",
             "window": f"each event with the pixel's last in {data.window_ms:g} ms",
         }
-        add("event loss", True, f"{data.event_pairs} pairs a step: {values[data.pair_mode]}", "learns from events")
+        why = "learns from events"
+        if recording.refractory_period:
+            why += f"; pixels are blind for {recording.refractory_period * 1e-6:g} ms after an event"
+            if data.pair_mode != "successor":
+                why += ", for which only datamanager.pair-mode successor is exact"
+        add("event loss", True, f"{data.event_pairs} pairs a step: {values[data.pair_mode]}", why)
     else:
         add("event loss", False, "", f"supervision is {data.supervision}")
 
@@ -78,8 +83,8 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
     elif recording.contrast_thresholds is not None:
         model.contrast_thresholds, why = recording.contrast_thresholds, "the recording states them"
     else:
-        num_on = int((recording.events.p > 0).sum())
-        num_off = len(recording.events) - num_on
+        num_on = recording.index.num_positive
+        num_off = len(recording.index) - num_on
         model.contrast_thresholds = thresholds_from_polarity(num_on, num_off)
         why = f"{num_on:,} on and {num_off:,} off events; their mean is assumed"
     add("contrast thresholds", use_events, "on {:.3f}, off {:.3f}".format(*model.contrast_thresholds), why)
@@ -102,10 +107,18 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
             else "the recording holds no frames",
         )
 
+    colour_events = use_events and recording.bayer_pattern is not None
+    if colour_events and model.num_channels == 1:
+        raise RecordingError(
+            f"{recording.path}: the sensor has a colour filter ({recording.bayer_pattern}), but "
+            "--pipeline.model.num-channels is 1; leave that flag out, or set it to 3"
+        )
     if model.num_channels is None:
-        colour = use_frames and frames is not None and is_colour(load_image(frames.filenames[0]))
-        model.num_channels = 3 if colour else 1
+        colour_frames = use_frames and frames is not None and is_colour(load_image(frames.filenames[0]))
+        model.num_channels = 3 if colour_events or colour_frames else 1
     why = "the field learns from colour frames" if model.num_channels == 3 else "nothing here is in colour"
+    if colour_events:
+        why = f"the sensor has a colour filter ({recording.bayer_pattern})"
     add("colour", model.num_channels == 3, f"{model.num_channels} channel(s)", why)
 
     add(
@@ -127,8 +140,9 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
         why = "the recording states it" if recording.depth_range else "measured from events and poses"
         parser.depth_range = depth_range(recording, parser)
     near, far = parser.depth_range
-    _, scale, _ = scene_normalisation(recording, near, far)
-    add("contraction", False, f"box of depths {near:.2f} m to {far:.2f} m", why)
+    _, scale, _ = scene_normalisation(recording, near, far, parser.box)
+    box = f"box of depths {near:.2f} m to {far:.2f} m" if parser.box is None else f"cube of {2 * parser.box[3]:g} m"
+    add("contraction", False, box, why if parser.box is None else "set by flag or preset")
     if model.near_plane is None:
         model.near_plane = near * scale
     if model.max_res is None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from enerf_ns.dataparsers.recording import Events
 
 WIDTH, HEIGHT = 24, 18
 
@@ -14,8 +17,8 @@ EVENTS = np.array(
         # x, y, t (ns), p
         [3, 4, 110_000_000, 1],
         [23, 17, 200_000_000, -1],
-        [3, 4, 250_000_001, -1],
         [0, 0, 250_000_001, 1],
+        [3, 4, 250_000_001, -1],
         [3, 4, 400_000_000, 1],
         [0, 0, 900_000_000, 1],
     ]
@@ -24,6 +27,12 @@ EVENTS = np.array(
 
 POSE_TIMES = np.arange(11) * 100_000_000
 FRAME_TIMES = np.array([150_000_000, 450_000_000, 750_000_000])
+
+
+def joined(pieces: Iterable[Events]) -> Events:
+    """The events of a stream as one array a column."""
+    held = list(pieces)
+    return Events(*(np.concatenate([getattr(piece, name) for piece in held]) for name in "xytp"))
 
 
 def poses() -> np.ndarray:

@@ -334,7 +334,7 @@ def contents(folder: Path) -> dict[str, tuple[str, int]]:
 def read_all(folder: Path, format: str) -> None:
     """Reads everything that a recording refers to."""
     recording = read_recording(folder, format)
-    len(recording.events)
+    len(recording.index.events())
     for frames in (recording.frames, recording.blurred_frames):
         for file in frames.filenames if frames else ():
             load_image(file)

@@ -3,8 +3,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.calibration import Camera, check_rotation
 
 PINHOLE = Camera(12, 10, 20.0, 21.0, 6.0, 4.5)
 RADTAN = Camera(
@@ -78,3 +79,45 @@ def test_undistort_keeps_type_and_channels_and_leaves_pinhole_images_alone():
     image = np.random.default_rng(0).integers(0, 256, (10, 12, 3), dtype=np.uint8)
     np.testing.assert_array_equal(PINHOLE.undistort(image), image)
     assert PINHOLE.undistorted() == PINHOLE
+
+
+def lookup_of(camera: Camera) -> Camera:
+    """The camera as a table of directions, as the reference code prepares recordings: a rectify map and its matrix."""
+    rectified = camera.undistorted()
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).reshape(-1, 1, 2)
+    if camera.model == "fisheye":
+        undistort = cv2.fisheye.undistortPoints
+    else:
+        undistort = cv2.undistortPoints
+    rectify_map = undistort(
+        pixels.astype(np.float64), camera.matrix, np.array(camera.distortion), R=np.eye(3), P=rectified.matrix
+    ).reshape(camera.height, camera.width, 2)
+    centre, focal = [rectified.cx, rectified.cy], [rectified.fx, rectified.fy]
+    values = rectified.width, rectified.height, *focal, *centre
+    return Camera(*values, model="lookup", directions=(rectify_map - centre) / focal)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(120, 90, 95.0, 96.0, 58.0, 46.0, (-0.14, 0.09, -0.0003, 0.0002), "radtan"),
+        Camera(120, 90, 95.0, 96.0, 58.0, 46.0, (-0.115, -0.062, 0.217, -0.235), "fisheye"),
+    ],
+    ids=["radtan", "fisheye"],
+)
+def test_a_table_of_directions_is_as_good_as_the_distortion(camera: Camera):
+    lookup = lookup_of(camera)
+    assert lookup.undistorted() == camera.undistorted()
+    np.testing.assert_allclose(lookup.pixel_directions(), camera.pixel_directions(), atol=1e-4)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    smooth = np.stack([127 + 100 * np.sin(columns / 9.0), 127 + 100 * np.cos(rows / 7.0)], axis=-1)
+    expected, found = camera.undistort(smooth.astype(np.float32)), lookup.undistort(smooth.astype(np.float32))
+    assert np.abs(found - expected)[2:-2, 2:-2].max() < 1.0
+
+
+def test_a_rotation_neither_stretches_nor_mirrors():
+    turned = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    check_rotation(turned)
+    for wrong in (1.01 * turned, turned @ np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match="is no rotation"):
+            check_rotation(wrong)

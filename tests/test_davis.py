@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis
+from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, joined, poses, write_davis
 
 from enerf_ns.dataparsers import davis
 from enerf_ns.dataparsers.calibration import Camera
@@ -21,7 +21,7 @@ EPOCH = 1_468_939_802_123_456_789
 @pytest.mark.parametrize("zero", [0, EPOCH])
 def test_reads_what_was_written(tmp_path: Path, zero: int):
     recording = read_recording(write_davis(tmp_path / "davis", zero=zero))
-    events, trajectory = recording.events, recording.trajectory
+    events, trajectory = recording.index.events(), recording.trajectory
     np.testing.assert_array_equal(np.stack([events.x, events.y, events.t, events.p], axis=1), EVENTS)
     np.testing.assert_array_equal(trajectory.times, POSE_TIMES)
     np.testing.assert_allclose(np.column_stack([trajectory.positions, trajectory.quaternions]), poses(), atol=1e-15)
@@ -39,7 +39,7 @@ def test_the_zero_of_time_is_the_earliest_first_stamp(tmp_path: Path):
     (folder / "events.txt").write_text("4.900000000 1 1 1\n" + lines)
     recording = read_recording(folder)
     assert recording.trajectory.start == 100_000_000
-    assert recording.events.t[0] == EVENTS[0, 2] + 100_000_000
+    assert recording.index.events().t[0] == EVENTS[0, 2] + 100_000_000
 
 
 def test_without_frames_the_sensor_is_the_davis240c(tmp_path: Path):
@@ -71,7 +71,7 @@ def test_line_ends_and_separators(tmp_path: Path, end: str, separator: str):
     text = (folder / "events.txt").read_text().rstrip("\n").replace(" ", separator)
     text = text.replace("\n", "\r\n") if end == "\r\n" else text
     (folder / "events.txt").write_bytes((text + end).encode())
-    assert len(read_recording(folder).events) == len(EVENTS)
+    assert len(read_recording(folder).index.events()) == len(EVENTS)
 
 
 def test_event_times_are_exact_however_they_are_written(tmp_path: Path):
@@ -81,7 +81,7 @@ def test_event_times_are_exact_however_they_are_written(tmp_path: Path):
     ]  # fmt: skip
     path = tmp_path / "events.txt"
     path.write_text("".join(f"{time} 1e1 2.0 +1\n" for time in times))
-    events = davis._read_events(path, zero=0)
+    events = joined(davis._stream_events(path, path.stat().st_size, zero=0))
     assert events.t.tolist() == [int(Decimal(time) * 10**9) for time in times]
     assert set(events.x.tolist()) == {10} and set(events.y.tolist()) == {2} and set(events.p.tolist()) == {1}
 
@@ -93,7 +93,7 @@ def test_files_larger_than_a_piece_are_read_whole(tmp_path: Path, monkeypatch: p
     path.write_text("\n".join(f"{t // 10**9}.{t % 10**9:09d} {x} {y} {p}" for t, x, y, p in rows.tolist()))
     for size in (1, 37, 1000):
         monkeypatch.setattr(davis, "BYTES_AT_A_TIME", size)
-        events = davis._read_events(path, zero=0)
+        events = joined(davis._stream_events(path, path.stat().st_size, zero=0))
         np.testing.assert_array_equal(np.column_stack([events.t, events.x, events.y, events.p]), rows)
 
 
@@ -103,7 +103,7 @@ def slider(shared_data: Path) -> EventRecording:
 
 
 def test_slider_depth_holds_what_its_files_hold(slider: EventRecording):
-    raw = slider.load_events()
+    raw = joined(slider.stream_events())
     assert len(raw) == 1_078_541
     assert (raw.p == 0).sum() / (raw.p == 1).sum() == pytest.approx(1.41, abs=0.005)
     assert raw.t[[0, -1]].tolist() == [3_811_000, 3_404_080_001]
@@ -111,7 +111,7 @@ def test_slider_depth_holds_what_its_files_hold(slider: EventRecording):
     expected = np.column_stack([np.rint(table[:, 0] * 1e9), table[:, 1:]])
     np.testing.assert_array_equal(np.column_stack([raw.t, raw.x, raw.y, raw.p])[:10_000], expected)
 
-    assert len(slider.events) == np.count_nonzero((raw.t >= 22_291_582) & (raw.t <= 3_402_486_198))
+    assert len(slider.index.events()) == np.count_nonzero((raw.t >= 22_291_582) & (raw.t <= 3_402_486_198))
     assert slider.frames is not None and len(slider.frames.times) == 86
     assert slider.notes[0] == "1 of 87 frames (1.1 %) lie outside the poses and are left out."
     assert "of 1,078,541 events (0.32 %) lie outside the poses" in slider.notes[1]

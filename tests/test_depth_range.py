@@ -104,5 +104,5 @@ def test_events_without_structure_are_refused():
 def test_slider_depth(shared_data: Path):
     """Its authors state depths of 0.45 to 2.07 m."""
     recording = read_recording(shared_data / "slider_depth")
-    near, far = estimate_depth_range(recording.events, recording.camera, recording.trajectory)
+    near, far = estimate_depth_range(recording.index.events(), recording.camera, recording.trajectory)
     assert 0.2 < near < 0.45 and 2.07 < far < 4.0

@@ -20,7 +20,7 @@ def test_events_of_all_files(tmp_path: Path, dtype: type, off: int, fifth_column
         rows = np.load(file)
         rows[rows[:, 3] < 0, 3] = off
         np.save(file, np.column_stack([rows, np.full(len(rows), 99)]) if fifth_column else rows)
-    events = read_recording(folder, "esim").events
+    events = read_recording(folder, "esim").index.events()
     np.testing.assert_array_equal(np.stack([events.x, events.y, events.t, events.p], axis=1), EVENTS)
 
 
@@ -28,13 +28,13 @@ def test_event_files_are_read_in_the_order_of_their_names(tmp_path: Path):
     folder = write_esim(tmp_path / "esim")
     for old, new in (("00001", "b"), ("00000", "a")):
         (folder / f"events/{old}.npy").rename(folder / f"events/{new}.npy")
-    assert (np.diff(read_recording(folder).events.t) >= 0).all()
+    assert (np.diff(read_recording(folder).index.events().t) >= 0).all()
 
 
 def test_a_file_without_events_is_fine(tmp_path: Path):
     folder = write_esim(tmp_path / "esim")
     np.save(folder / "events/00000b.npy", np.zeros((0, 4)))
-    assert len(read_recording(folder).events) == len(EVENTS)
+    assert len(read_recording(folder).index.events()) == len(EVENTS)
 
 
 def test_poses_and_camera(tmp_path: Path):

@@ -9,10 +9,12 @@ import torch
 
 from enerf_ns.event_camera import (
     DEFAULT_CONTRAST_THRESHOLD,
+    color_channels,
     inverse_linlog,
     linlog,
     luma,
     measured_change,
+    pixel_brightness,
     thresholds_from_polarity,
 )
 
@@ -58,6 +60,34 @@ def test_luma_is_the_grey_of_opencv():
 def test_luma_of_one_channel_is_that_channel():
     grey = torch.rand(4, 5, 1)
     torch.testing.assert_close(luma(grey), grey[..., 0], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("width", "height"), [(4, 4), (5, 3), (1, 2), (6, 1)])
+@pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "BGGR", "RRGB"])
+def test_every_pixel_sees_the_channel_of_its_filter(pattern: str, width: int, height: int):
+    letters = [pattern[2 * (y % 2) + x % 2] for y in range(height) for x in range(width)]
+    channels = color_channels(pattern, width, height)
+    assert channels.dtype == torch.int64
+    assert "".join("RGB"[channel] for channel in channels.tolist()) == "".join(letters)
+
+
+@pytest.mark.parametrize("pattern", ["", "RGB", "RGGBR", "RGBW", "rggb"])
+def test_what_is_no_colour_filter_is_refused(pattern: str):
+    with pytest.raises(ValueError, match="four letters"):
+        color_channels(pattern, 4, 4)
+
+
+def test_a_mosaic_is_that_of_opencv_demosaiced():
+    """OpenCV leaves the channel that a pixel sees as it is; it names patterns by the pixels (1, 1) to (2, 2)."""
+    mosaic = np.random.default_rng(0).integers(0, 256, (8, 10), dtype=np.uint8)
+    rgb = torch.from_numpy(cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2RGB)).float()
+    seen = pixel_brightness(rgb, color_channels("RGGB", 10, 8).reshape(8, 10))
+    np.testing.assert_array_equal(seen[1:-1, 1:-1], mosaic[1:-1, 1:-1])
+
+
+def test_a_grey_sensor_sees_luma():
+    rgb = torch.rand(4, 5, 3)
+    torch.testing.assert_close(pixel_brightness(rgb, None), luma(rgb), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("thresholds", [(0.25, 0.25), (0.2, 0.35)])

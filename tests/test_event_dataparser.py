@@ -257,3 +257,42 @@ def test_a_depth_range_that_is_none_is_an_error(tmp_path: Path, flag: tuple[floa
     parser = EventDataParserConfig(data=write_esim(tmp_path / "esim"), depth_range=flag).setup()
     with pytest.raises(RecordingError, match="depth range"):
         parser.outputs(parser.recording(), "train")
+
+
+def frame_numbers(outputs: DataparserOutputs) -> list[int]:
+    return [int(path.stem) for path in outputs.image_filenames]
+
+
+def test_frames_are_chosen_by_number(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    assert frame_numbers(parse(folder)) == [0, 1] and frame_numbers(parse(folder, "val")) == [2]
+    chosen = {"train_frame_indices": (1,), "held_out_frame_indices": (0, 2)}
+    assert frame_numbers(parse(folder, **chosen)) == [1]
+    assert frame_numbers(parse(folder, "val", **chosen)) == [0, 2]
+    assert frame_numbers(parse(folder, held_out_frame_indices=(0,))) == [1, 2]
+
+
+def test_frame_numbers_count_those_without_a_pose(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    rows = (folder / "0_poses_all.txt").read_text().splitlines()
+    (folder / "0_poses_all.txt").write_text("\n".join([rows[0], *rows[4:]]))  # begin after the first frame
+    assert frame_numbers(parse(folder, train_frame_indices=(0, 1), held_out_frame_indices=(2,))) == [1]
+
+
+def test_a_time_range_limits_events_and_frames(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    outputs = parse(folder, time_range=(0.2, 0.8), held_out_every=2)
+    recording = outputs.metadata["recording"]
+    assert recording.index.events().t.tolist() == [t for t in EVENTS[:, 2] if 2e8 <= t <= 8e8]
+    assert frame_numbers(outputs) == [1] and frame_numbers(parse(folder, "val", time_range=(0.2, 0.8))) == [1, 2]
+    with pytest.raises(RecordingError, match=r"--time-range 7 9 \(seconds\) holds none of the poses"):
+        read_recording(folder, time_range=(7.0, 9.0))
+
+
+def test_a_box_is_a_cube_of_the_world(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    outputs = parse(folder, box=(2.0, 1.0, -3.0, 4.0))
+    transform, scale = outputs.dataparser_transform.numpy(), outputs.dataparser_scale
+    for corner, mapped in (((-2, -3, -7), (-1, -1, -1)), ((6, 5, 1), (1, 1, 1)), ((2, 1, -3), (0, 0, 0))):
+        np.testing.assert_allclose(scale * (transform @ [*corner, 1.0]), mapped, atol=1e-6)
+    np.testing.assert_array_equal(outputs.scene_box.aabb, [[-1, -1, -1], [1, 1, 1]])

@@ -1,14 +1,20 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from math import sin
 
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 from scipy.stats import chisquare
 
+from enerf_ns import event_sampler
 from enerf_ns.dataparsers.events import EventIndex
 from enerf_ns.dataparsers.recording import Events
+from enerf_ns.event_camera import measured_change
 from enerf_ns.event_sampler import EventPairs, EventPairSampler, SilentPixelSampler
 
 WIDTH, HEIGHT = 5, 4
@@ -100,6 +106,88 @@ def test_pairs_are_uniform_and_count_their_events(mode, uniform_over, equal_stam
     assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("chunk", [1, 2, 7])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize("mode", MODES)
+def test_events_in_small_chunks_make_the_same_pairs(mode, equal_stamps: bool, chunk: int, monkeypatch) -> None:
+    monkeypatch.setattr(event_sampler, "CHUNK", chunk)
+    pixels = recording(equal_stamps)
+    expected = all_pairs(pixels, mode, 3)
+    sampler = EventPairSampler(index_of(pixels), mode, 3, WINDOW)
+    assert sampler.num_pairs == len(expected)
+    drawn = sampler.sample(60 * len(expected), torch.Generator().manual_seed(0))
+    assert set(rows(drawn)) == set(expected)
+
+
+@pytest.mark.parametrize("refractory", [1, 30, 5000])
+@pytest.mark.parametrize("mode", MODES)
+def test_a_pair_begins_when_the_pixel_sees_again_and_never_at_its_end(mode, refractory: int) -> None:
+    pixels = recording(True)
+    expected = [(pixel, min(a + refractory, b - 1), b) for pixel, a, b in all_pairs(pixels, mode, 3)]
+    sampler = EventPairSampler(index_of(pixels), mode, 3, WINDOW, refractory_ns=refractory)
+    without = EventPairSampler(index_of(pixels), mode, 3, WINDOW)
+    pairs, same = (s.sample(60 * len(expected), torch.Generator().manual_seed(0)) for s in (sampler, without))
+    assert set(rows(pairs)) == set(expected)
+    assert torch.equal(pairs.on, same.on) and torch.equal(pairs.off, same.off)
+
+
+def fire(signal: Callable[[float], float], end: float, on: float, off: float, refractory: int) -> list[tuple[int, int]]:
+    """(time, polarity) of an ideal pixel that is blind after each event and then remembers what it sees first.
+
+    It walks along log brightness in steps of 0.1 ms, and finds the crossing within a step by root finding.
+    """
+    events: list[tuple[int, int]] = []
+    time, reference = 0.0, signal(0.0)
+    while time < end:
+        following = time + 1e5
+        change = signal(following) - reference
+        if -off < change < on:
+            time = following
+            continue
+        level = reference + (on if change > 0 else -off)
+        time = float(brentq(lambda t, level=level: signal(t) - level, time, following))
+        events.append((round(time), 1 if change > 0 else -1))
+        time += refractory
+        reference = signal(time)
+    return events
+
+
+THRESHOLDS = (0.2, 0.25)
+
+
+def signal_of(pixel: int) -> Callable[[float], float]:
+    """Log brightness over a second, as a function of time in ns."""
+    return lambda t: sin((9 + pixel) * t * 1e-9) + 0.4 * sin((23 - pixel) * t * 1e-9 + pixel)
+
+
+@pytest.mark.parametrize("refractory", [0, 1_000_000, 8_000_000])
+def test_successors_measure_the_threshold_and_other_pairs_miss_what_changes_while_the_pixel_is_blind(refractory: int):
+    pixels = {pixel: fire(signal_of(pixel), 1e9, *THRESHOLDS, refractory) for pixel in range(6)}
+    generator = torch.Generator().manual_seed(0)
+    blind = {
+        (pixel, time): signal_of(pixel)(time + refractory) - signal_of(pixel)(time)
+        for pixel, events in pixels.items()
+        for time, _ in events
+    }
+
+    def errors(sampler: EventPairSampler) -> tuple[list[float], list[float]]:
+        """Of every drawn pair, the change that it measures too little, and what changed in between unseen."""
+        pairs = sampler.sample(2000, generator)
+        measured = measured_change(pairs.on.double(), pairs.off.double(), THRESHOLDS).tolist()
+        changes = [signal_of(pixel)(end) - signal_of(pixel)(start) for pixel, start, end in rows(pairs)]
+        unseen = [sum(blind[pixel, t] for t, _ in pixels[pixel] if a < t < b) for pixel, a, b in rows(pairs)]
+        return [change - m for change, m in zip(changes, measured, strict=True)], unseen
+
+    index = index_of(pixels)
+    error, unseen = errors(EventPairSampler(index, "successor", refractory_ns=refractory))
+    assert not any(unseen)
+    np.testing.assert_allclose(error, 0.0, atol=1e-7)
+    error, unseen = errors(EventPairSampler(index, "partner", 4, refractory_ns=refractory))
+    np.testing.assert_allclose(error, unseen, atol=1e-7)
+    error, _ = errors(EventPairSampler(index, "successor"))
+    assert (max(map(abs, error)) > 0.01) == (refractory > 0)
+
+
 def test_the_same_seed_draws_the_same_pairs() -> None:
     sampler = EventPairSampler(index_of(recording(False)), "partner")
     one, same, other = (rows(sampler.sample(100, torch.Generator().manual_seed(seed))) for seed in (3, 3, 4))
@@ -148,18 +236,18 @@ def test_no_pair_in_any_window_is_an_error() -> None:
 
 def test_no_event_at_all_is_an_error() -> None:
     empty = EventIndex(
-        torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)
+        torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int32), torch.zeros(21, dtype=torch.int64), WIDTH
     )
     for mode in ("successor", "window"):
         with pytest.raises(ValueError, match="no pair"):
             EventPairSampler(empty, mode)
 
 
-def silent_stretches(pixels: dict, start: int, end: int) -> dict[int, list[tuple[int, int]]]:
+def silent_stretches(pixels: dict, start: int, end: int, refractory: int = 0) -> dict[int, list[tuple[int, int]]]:
     """First and last instant of every stretch of each pixel without an event, by a loop over instants."""
     stretches = defaultdict(list)
     for pixel in range(WIDTH * HEIGHT):
-        times = {t for t, _ in pixels.get(pixel, [])}
+        times = {t + blind for t, _ in pixels.get(pixel, []) for blind in range(max(refractory, 1))}
         begin = None
         for instant in range(start, end + 2):
             silent = instant <= end and instant not in times
@@ -174,12 +262,13 @@ def silent_stretches(pixels: dict, start: int, end: int) -> dict[int, list[tuple
 @pytest.mark.parametrize(("start", "end"), [(START, END), (0, 1200), (300, 700)])
 @pytest.mark.parametrize("equal_stamps", [False, True])
 @pytest.mark.parametrize(("min_duration", "max_duration"), [(1, 2), (20, 60), (200, 10_000)])
-def test_silent_pixels_are_silent(start, end, equal_stamps, min_duration, max_duration, device: str) -> None:
+@pytest.mark.parametrize("refractory", [0, 25])
+def test_silent_pixels_are_silent(start, end, equal_stamps, min_duration, max_duration, refractory, device) -> None:
     pixels = recording(equal_stamps)
     pixels[1] = [(start, 1), (end, -1)]
-    stretches = silent_stretches(pixels, start, end)
+    stretches = silent_stretches(pixels, start, end, refractory)
     long_enough = {pixel: [(a, b) for a, b in found if b - a >= min_duration] for pixel, found in stretches.items()}
-    sampler = SilentPixelSampler(index_of(pixels, device), start, end, min_duration, max_duration)
+    sampler = SilentPixelSampler(index_of(pixels, device), start, end, min_duration, max_duration, refractory)
     pairs = sampler.sample(3000, torch.Generator(device).manual_seed(2))
     assert len(pairs) == 3000 and pairs.pixels.device.type == device
     assert not pairs.on.any() and not pairs.off.any()
@@ -190,11 +279,22 @@ def test_silent_pixels_are_silent(start, end, equal_stamps, min_duration, max_du
     assert set(pairs.pixels.tolist()) == {pixel for pixel, found in long_enough.items() if found}
 
 
-def test_silent_pixels_are_drawn_in_proportion_to_their_silence() -> None:
+def test_hot_pixels_only_look_silent(device: str) -> None:
+    """Their events were left out, so that those of pixels 0, 7 and 19 might be."""
     pixels = recording(False)
-    sampler = SilentPixelSampler(index_of(pixels), START, END, 100, 400)
+    hot = torch.tensor([0, 19], device=device)
+    sampler = SilentPixelSampler(replace(index_of(pixels, device), hot_pixels=hot), START, END, 1, 100)
+    pairs = sampler.sample(5000, torch.Generator(device).manual_seed(0))
+    assert set(pairs.pixels.tolist()) == set(range(WIDTH * HEIGHT)) - {0, 19}
+    assert_counts_are_right(pairs, pixels)
+
+
+@pytest.mark.parametrize("refractory", [0, 60])
+def test_silent_pixels_are_drawn_in_proportion_to_their_silence(refractory: int) -> None:
+    pixels = recording(False)
+    sampler = SilentPixelSampler(index_of(pixels), START, END, 100, 400, refractory)
     pairs = sampler.sample(20_000, torch.Generator().manual_seed(3))
-    stretches = silent_stretches(pixels, START, END)
+    stretches = silent_stretches(pixels, START, END, refractory)
     silence = np.array([sum(b - a + 1 for a, b in stretches[pixel] if b - a >= 100) for pixel in range(WIDTH * HEIGHT)])
     drawn = np.bincount(pairs.pixels.numpy(), minlength=WIDTH * HEIGHT)
     assert not drawn[silence == 0].any()

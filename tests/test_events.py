@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns.dataparsers.events import EventIndex
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.events import EventIndex, event_picture, sorted_bands, survey_events
 from enerf_ns.dataparsers.recording import Events
 
 
@@ -76,3 +77,91 @@ def test_events_outside_the_sensor_are_refused(x: int, y: int) -> None:
     )
     with pytest.raises(ValueError, match="outside the 4 x 3 sensor"):
         EventIndex.from_events(events, 4, 3)
+
+
+def test_hot_pixels_are_found_by_their_neighbourhood() -> None:
+    rng = np.random.default_rng(0)
+    width, height = 24, 18
+    counts = rng.poisson(20, (height, width))
+    counts[:, 12:] = rng.poisson(150, (height, 12))  # texture beside a plain region
+    counts[3, 4] = 2000
+    counts[0, 0] = 1500  # at the border
+    counts[9, 20] = 1000  # six times its neighbours: an edge
+    counts[17, 2] = 0
+    pixels = np.repeat(np.arange(width * height), counts.ravel())
+    rng.shuffle(pixels)
+    stream = [Events(pixels % width, pixels // width, np.arange(len(pixels)), np.ones(len(pixels), np.int8))]
+    survey = survey_events(lambda: iter(stream), width, height, 0, len(pixels))
+    np.testing.assert_array_equal(survey.counts, counts.ravel())
+    survey.leave_out_hot_pixels(height)
+    assert survey.hot_pixels.tolist() == [0, 3 * width + 4]
+    assert survey.num_hot_events == 3500
+    ((times, positives),) = sorted_bands(lambda: iter(stream), survey, 2**31)
+    kept = np.flatnonzero(~np.isin(pixels, survey.hot_pixels))
+    np.testing.assert_array_equal(times, kept[np.argsort(pixels[kept], kind="stable")])
+    np.testing.assert_array_equal(positives, np.arange(1, len(kept) + 1))
+
+
+def test_against_a_slow_dictionary_of_lists() -> None:
+    rng = np.random.default_rng(3)
+    events = random_events(5000, 16, 12, 10**6)
+    start, end = 200_000, 800_000
+    by_pixel: dict[int, list[tuple[int, int]]] = {}
+    for x, y, t, p in zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist(), strict=True):
+        if start <= t <= end:
+            by_pixel.setdefault(y * 16 + x, []).append((t, p))
+    pieces = np.split(np.arange(5000), np.sort(rng.integers(0, 5000, 9)))
+
+    def stream():
+        return iter([Events(*(getattr(events, name)[piece] for name in "xytp")) for piece in pieces])
+
+    survey = survey_events(stream, 16, 12, start, end)
+    for max_events in (1, 300, 5000):
+        bands = list(sorted_bands(stream, survey, max_events))
+        times, positives = (np.concatenate(parts) for parts in zip(*bands, strict=True))
+        assert len(bands) > 1 or max_events == 5000
+        index = EventIndex(torch.from_numpy(times), torch.from_numpy(positives), survey.offsets, 16)
+        polarity = np.diff(positives, prepend=0) * 2 - 1
+        for pixel in range(16 * 12):
+            mine = slice(int(index.offsets[pixel]), int(index.offsets[pixel + 1]))
+            assert list(zip(times[mine], polarity[mine], strict=True)) == by_pixel.get(pixel, [])
+
+    pixels, instants = torch.from_numpy(rng.integers(0, 16 * 12, 500)), torch.from_numpy(rng.integers(0, 10**6, 500))
+    counted = [
+        sum(t <= time for t, _ in by_pixel.get(pixel, []))
+        for pixel, time in zip(pixels.tolist(), instants.tolist(), strict=True)
+    ]
+    assert index.count_until(pixels, instants).tolist() == counted
+    in_order = sorted((t, pixel, p) for pixel, fired in by_pixel.items() for t, p in fired)
+    back = index.events()
+    assert list(zip(back.t, back.y.astype(int) * 16 + back.x, back.p, strict=True)) == in_order
+    assert index.span == (in_order[0][0], in_order[-1][0])
+    assert index.num_positive == sum(p > 0 for _, _, p in in_order)
+    assert len(index.events(at_most=100)) <= 100
+    assert set(zip(*(column.tolist() for column in vars(index.events(at_most=100)).values()), strict=True)) <= set(
+        zip(*(column.tolist() for column in vars(back).values()), strict=True)
+    )
+
+
+def test_a_picture_shows_the_latest_event_of_each_pixel() -> None:
+    camera = Camera(10, 5, 10.0, 10.0, 5.0, 2.5)
+    t = np.arange(20)
+    x, y = np.array([t % 10, t // 10 % 5])
+    x[15], y[15] = 3, 0  # again
+    p = np.where(t % 3, 1, -1)
+    index = EventIndex.from_events(Events(x, y, t, p), 10, 5)
+    picture = event_picture(index, camera, 17)  # a fifth of 50 pixels: the latest ten
+    drawn = {}
+    for event in range(17, -1, -1):
+        if len(drawn) < 10:
+            drawn.setdefault((y[event], x[event]), p[event])
+    for row in range(5):
+        for column in range(10):
+            red, _, blue = picture[row, column].tolist()
+            expected = drawn.get((row, column))
+            assert (red > blue, blue > red) == (expected == 1, expected == -1)
+
+
+def test_a_picture_before_the_first_event_is_white() -> None:
+    index = EventIndex.from_events(random_events(100, 8, 6, 10**6), 8, 6)
+    assert (event_picture(index, Camera(8, 6, 10.0, 10.0, 4.0, 3.0), -1) == 255).all()

@@ -20,11 +20,11 @@ def recording(columns: np.ndarray, start: int = 0, end: int = 100, frame_times: 
     names = tuple(Path(f"{time}.png") for time in frame_times)
     depth = tuple(Path(f"{time}.npy") for time in frame_times)
     frames = Frames(names, np.array(frame_times), CAMERA, trajectory, depth) if frame_times else None
-    return EventRecording(Path("memory"), "test", CAMERA, trajectory, lambda: Events(*columns.T), frames)
+    return EventRecording(Path("memory"), "test", CAMERA, trajectory, lambda: iter([Events(*columns.T)]), (), frames)
 
 
 def test_events_have_the_types_that_everything_builds_on():
-    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]])).events
+    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]])).index.events()
     assert [column.dtype for column in (events.x, events.y, events.t, events.p)] == [
         np.uint16, np.uint16, np.int64, np.int8,
     ]  # fmt: skip
@@ -37,23 +37,23 @@ def test_events_have_the_types_that_everything_builds_on():
 )
 def test_polarities_become_plus_and_minus_one(off: int, dtype: type):
     events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [1, 2, 7, 1]]))
-    raw = events.load_events()
-    events.load_events = lambda: Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))
-    assert events.events.p.tolist() == [-1, 1, -1]
+    (raw,) = events.stream_events()
+    events.stream_events = lambda: iter([Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))])
+    assert events.index.events().p.tolist() == [-1, 1, -1]
 
 
 def test_events_of_one_polarity_only_are_fine():
-    assert recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]])).events.p.tolist() == [1, 1]
-    assert recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]])).events.p.tolist() == [-1, -1]
+    assert recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]])).index.events().p.tolist() == [1, 1]
+    assert recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]])).index.events().p.tolist() == [-1, -1]
 
 
 def test_events_outside_the_poses_are_dropped_and_counted():
     times = np.array([9, 10, 10, 50, 100, 101])
     rows = np.column_stack([np.full_like(times, 3), np.full_like(times, 4), times, np.ones_like(times)])
     clipped = recording(rows, start=10)
-    assert clipped.events.t.tolist() == [10, 10, 50, 100]
+    assert clipped.index.events().t.tolist() == [10, 10, 50, 100]
     assert clipped.notes == ["2 of 6 events (33 %) lie outside the poses and are left out."]
-    assert clipped.events is clipped.events
+    assert clipped.index is clipped.index
 
 
 def test_frames_outside_the_poses_are_dropped_and_counted():
@@ -68,7 +68,7 @@ def test_frames_outside_the_poses_are_dropped_and_counted():
 
 def test_nothing_is_noted_when_nothing_is_dropped():
     whole = recording(np.array([[1, 2, 0, 1], [1, 2, 100, 1]]), frame_times=(0, 100))
-    assert len(whole.events) == 2 and whole.notes == []
+    assert len(whole.index.events()) == 2 and whole.notes == []
 
 
 def test_read_recording_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

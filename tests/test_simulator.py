@@ -262,7 +262,7 @@ def test_the_recording_is_read_back(recording):
     times = torch.linspace(0, 3e8, 50).long()
     written = torch.from_numpy(written_poses(recording, times.numpy()))
     torch.testing.assert_close(read.trajectory.poses(times), written, atol=1e-9, rtol=0)
-    assert len(read.events) == json.loads((recording / "simulation.json").read_text())["num_events"]
+    assert len(read.index.events()) == json.loads((recording / "simulation.json").read_text())["num_events"]
 
 
 def test_the_same_seed_writes_the_same_files_and_another_seed_others(tmp_path):

@@ -162,3 +162,14 @@ def test_times_outside_are_told_and_refused() -> None:
 def test_bad_poses_are_refused(times: list, positions: list, quaternions: list) -> None:
     with pytest.raises(ValueError):
         Trajectory(np.array(times), np.array(positions, dtype=float), np.array(quaternions, dtype=float))
+
+
+def test_a_mounted_camera_moves_with_the_body() -> None:
+    rng = np.random.default_rng(5)
+    times, positions, quaternions = np.arange(6) * 10**8, rng.normal(size=(6, 3)), Rotation.random(6, rng).as_quat()
+    mount = np.eye(4)
+    mount[:3, :3], mount[:3, 3] = Rotation.from_rotvec([0.4, -0.1, 0.9]).as_matrix(), [0.1, -0.2, 0.05]
+    bodies = np.tile(np.eye(4), (6, 1, 1))
+    bodies[:, :3, :3], bodies[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), positions
+    mounted = Trajectory(times, positions, quaternions).of_mounted(mount)
+    np.testing.assert_allclose(mounted.poses(torch.from_numpy(times)).numpy(), (bodies @ mount)[:, :3], atol=1e-12)

@@ -51,7 +51,7 @@ class Demo:
         run_config = config.get_base_dir() / "config.yml"
         _, pipeline, _, _ = eval_setup(run_config)
         assert isinstance(pipeline, EnerfPipeline)
-        events = len(pipeline.datamanager.train_dataset.recording.events)
+        events = len(pipeline.datamanager.train_dataset.recording.index)
         extra = {"train_seconds": round(train_seconds, 1), "events": events}
         scores = write_scores_and_picture(pipeline, output_dir, extra)
         render_video(pipeline, run_config, output_dir)

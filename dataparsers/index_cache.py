@@ -1,0 +1,165 @@
+"""Indices of events on disk, so that a large recording is sorted once.
+
+An entry is a folder named after a hash of what the index was made from. It is written beside its place and then
+renamed, so that it is whole or not there, however many processes build it at once and wherever they are stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+import zlib
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from enerf_ns.dataparsers.events import EventIndex, EventStream, Survey, sorted_bands
+
+LAYOUT = 1
+"""Counted up when what is stored changes."""
+
+CACHED_FROM = 2_000_000
+"""Fewer events are sorted again each time, which takes less than a second."""
+
+COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
+
+CHECKED_BLOCKS, BLOCK = 64, 2**16
+"""Blocks of each file, and bytes of each block, whose checksum is compared when an entry is used."""
+
+STALE_SECONDS = 86400
+"""Age from which what an interrupted process has left behind is removed."""
+
+
+def cache_folder() -> Path:
+    """Where the indices lie: $ENERF_CACHE, else enerf-ns in the user's cache folder."""
+    if "ENERF_CACHE" in os.environ:
+        return Path(os.environ["ENERF_CACHE"]).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "enerf-ns"
+
+
+def entry_name(**made_from: object) -> str:
+    """Name of the entry for an index that is determined by these values (JSON types)."""
+    text = json.dumps({"layout": LAYOUT, **made_from}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def load_index(name: str) -> tuple[EventIndex, Survey] | None:
+    """An index from the cache, mapped into memory; None where there is none. A damaged one is removed."""
+    folder = cache_folder() / name
+    try:
+        stored = json.loads((folder / "index.json").read_text())
+        for column in COLUMNS:
+            if _checksum(folder / column) != stored["checksums"][column]:
+                raise ValueError(f"{column} is damaged")
+        times, positives, counts = (np.memmap(folder / column, kind, "c") for column, kind in COLUMNS.items())
+        survey = Survey(counts=np.array(counts), **stored["survey"])
+        survey.hot_pixels = np.array(survey.hot_pixels, np.int64)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError):
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+    return _index(times, positives, survey), survey
+
+
+def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]) -> EventIndex:
+    """Sorts the events, and stores the index in the cache where that pays.
+
+    Of more events than a quarter of the memory holds, a band of pixels after the other is sorted and written.
+
+    Args:
+        stream: The events that were surveyed.
+        survey: Without faults.
+        name: Of the entry.
+        notes: Gets a sentence where the index could not be stored.
+
+    Raises:
+        OSError: The events do not fit into memory, and cannot be stored either.
+        ValueError: The events are not those that were surveyed.
+    """
+    num_events, in_memory = int(survey.counts.sum()), _physical_memory() // 4 // 12
+    bands = sorted_bands(stream, survey, in_memory)
+    if num_events < CACHED_FROM:
+        return _index(*next(bands), survey)
+    if num_events > in_memory:
+        _store(name, survey, bands)
+    else:
+        times, positives = next(bands)
+        try:
+            _store(name, survey, iter([(times, positives)]))
+        except OSError as error:
+            notes.append(
+                f"The index of {num_events:,} events could not be stored in {cache_folder()} "
+                f"({error.strerror or error}), so that the next start takes as long; make room, or set ENERF_CACHE to "
+                "another folder."
+            )
+            return _index(times, positives, survey)
+        del times, positives
+    loaded = load_index(name)
+    if loaded is None:
+        raise OSError(f"the index could not be read back from {cache_folder() / name}")
+    return loaded[0]
+
+
+def _store(name: str, survey: Survey, bands) -> None:
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    for left_behind in cache_folder().glob(".partial-*"):
+        if time.time() - left_behind.stat().st_mtime > STALE_SECONDS:
+            shutil.rmtree(left_behind, ignore_errors=True)
+    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=cache_folder()))
+    try:
+        with open(partial / "times", "wb") as times_file, open(partial / "positives", "wb") as positives_file:
+            for times, positives in bands:
+                times_file.write(times.data)
+                positives_file.write(positives.data)
+        survey.counts.tofile(partial / "counts")
+        facts = {key: value for key, value in asdict(survey).items() if key != "counts"}
+        facts["hot_pixels"] = survey.hot_pixels.tolist()
+        checksums = {}
+        for column in COLUMNS:
+            with open(partial / column, "rb+") as file:
+                os.fsync(file.fileno())
+            checksums[column] = _checksum(partial / column)
+        (partial / "index.json").write_text(json.dumps({"survey": facts, "checksums": checksums}))
+        try:
+            partial.rename(cache_folder() / name)
+        except OSError:
+            if load_index(name) is None:  # else another process was faster
+                raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _index(times: np.ndarray, positives: np.ndarray, survey: Survey) -> EventIndex:
+    return EventIndex(
+        torch.from_numpy(times),
+        torch.from_numpy(positives),
+        survey.offsets,
+        survey.width,
+        torch.from_numpy(survey.hot_pixels),
+    )
+
+
+def _checksum(path: Path) -> list[int]:
+    """Size of a file, and a checksum of blocks spread evenly over it."""
+    size = path.stat().st_size
+    checksum = 0
+    with open(path, "rb") as file:
+        for start in np.linspace(0, max(size - BLOCK, 0), CHECKED_BLOCKS).astype(np.int64).tolist():
+            file.seek(start)
+            checksum = zlib.crc32(file.read(BLOCK), checksum)
+    return [size, checksum]
+
+
+def _physical_memory() -> int:
+    """Bytes; of a system that does not tell, 8 GiB."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 8 * 2**30
