@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
@@ -120,9 +121,9 @@ enerf_paper = MethodSpecification(
                 event_loss="squared",
                 sampling="uniform",
                 num_samples=512,
-                no_event_loss_weight=1.0,
-                no_event_margin=1.0,
-                frame_loss_weight=1.0,
+                no_event_loss_weight=5.0,  # 1 / C and 1 / C^2 at the paper's C = 0.2: its weights of 1, since losses
+                no_event_margin=1.0,  # here count changes in thresholds
+                frame_loss_weight=25.0,
                 opacity_loss_weight=0.0,
                 distortion_loss_weight=0.0,
                 eval_num_rays_per_chunk=RAYS_PER_CHUNK,
@@ -131,3 +132,6 @@ enerf_paper = MethodSpecification(
     ),
     description="E-NeRF with the sampling and field of the paper (Klenk et al., RA-L 2023).",
 )
+
+METHODS = {method.config.method_name: deepcopy(method.config) for method in (enerf, enerf_paper)}
+"""Settings of the methods as they are before flags change them."""

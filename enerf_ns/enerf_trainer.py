@@ -6,15 +6,17 @@ import json
 import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, scene_normalisation
+from enerf_ns.dataparsers.inspection import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, RecordingError
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.presets import PresetName, apply_preset
 from enerf_ns.scene_choices import Choice, absolute, fill_in_choices
 
 
@@ -24,6 +26,8 @@ class EnerfTrainerConfig(TrainerConfig):
 
     _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
+    preset: Optional[PresetName] = None  # noqa: UP045
+    """The selections of the E-NeRF paper for one of its sequences; flags that are set stand."""
 
     def prepare(self) -> tuple[EventRecording, list[Choice]]:
         """Read the recording and fill in what is open: paths, decay of the learning rate, choices.
@@ -43,7 +47,14 @@ class EnerfTrainerConfig(TrainerConfig):
         for group in self.optimizers.values():
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         recording = EventDataParser(manager.dataparser).recording()
-        choices = fill_in_choices(self.pipeline, recording)
+        selected = []
+        if self.preset is not None:
+            from enerf_ns.enerf_config import METHODS  # here, since it imports this module
+
+            lines = apply_preset(self, METHODS[self.method_name], recording)
+            selected = [Choice("preset", True, line, "") for line in lines]
+            recording = EventDataParser(manager.dataparser).recording()
+        choices = selected + fill_in_choices(self.pipeline, recording)
         recording.index  # noqa: B018 - reads and checks the events
         return recording, choices
 
@@ -113,6 +124,8 @@ def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Ta
         table.add_row(name, value)
     for note in recording.notes:
         table.add_row("note", f"[yellow]{note}[/yellow]")
+    for problem in find_problems(recording, depth):
+        table.add_row("[red]problem[/red]", f"[red]{problem.what}[/red] {problem.advice}")
     return table
 
 

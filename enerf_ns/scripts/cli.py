@@ -8,12 +8,16 @@ from typing import Annotated, Union  # tyro reads these annotations on Python 3.
 import tyro
 
 from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.demo import Demo
+from enerf_ns.scripts.inspect import Inspect
 from enerf_ns.scripts.report import Report
 from enerf_ns.scripts.simulate import Simulate
 
 Command = Union[  # noqa: UP007
+    Annotated[Convert, tyro.conf.subcommand(name="convert")],
     Annotated[Demo, tyro.conf.subcommand(name="demo")],
+    Annotated[Inspect, tyro.conf.subcommand(name="inspect")],
     Annotated[Report, tyro.conf.subcommand(name="report")],
     Annotated[Simulate, tyro.conf.subcommand(name="simulate")],
 ]

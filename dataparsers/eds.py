@@ -1,0 +1,365 @@
+"""Reader for EDS, as it is unpacked and as E-NeRF's reference code prepares it.
+
+As unpacked, on a clock of absolute times:
+
+    events.h5                         x, y, t (µs), p
+    stamped_groundtruth.txt           t_s px py pz qx qy qz qw; event camera to world, OpenCV axes, metres
+    images/*.png                      of the RGB camera, with images_timestamps.txt, one stamp (µs) a line (optional)
+    *camchain*.yaml                   Kalibr's calibration, here or in a calibration folder beside this one (optional)
+
+As prepared, on a clock that starts with the recording:
+
+    events.h5                         x, y, t (µs), p
+    stamped_groundtruth_us.txt        as above, with t_us
+    rectify_map_calib0.h5             rectify_map (480, 640, 2): undistorted place of each pixel of the event camera
+    calib_undist_calib0.json          intrinsics_undistorted of the RGB and of the event camera
+    images_undistorted_calib0/*.png   with images_timestamps_us.txt (optional)
+
+The preparation writes into the unpacked folder and converts events.h5 in place, so that both layouts may lie in one
+folder: what is on the clock of the events is used. The published files do not tell to which part of the exposure the
+stamp of an image belongs; it is taken for the middle.
+
+Hidalgo-Carrió et al., "Event-aided direct sparse odometry", CVPR 2022.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from enerf_ns.dataparsers.calibration import Camera, check_rotation
+from enerf_ns.dataparsers.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, check_image_size
+from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
+
+SENSOR_SIZE = (640, 480)
+"""Width and height of the event camera, and of the images, in pixels."""
+
+RAW_POSES, PREPARED_POSES = "stamped_groundtruth.txt", "stamped_groundtruth_us.txt"
+RAW_IMAGES, PREPARED_IMAGES = "images", "images_undistorted_calib0"
+STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
+
+OFFSET_TOLERANCE = 2000
+"""ns by which the preparation may round a time."""
+
+CHECKED_STEP = 16
+"""Of all rows and columns, one of so many is looked at to see whether a calibration is of a lens."""
+
+KALIBR_MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
+"""Kalibr's names of the distortion models, and ours."""
+
+PUBLISHED_RGB_CAMERA = Camera(
+    *SENSOR_SIZE,
+    *(766.536025127154, 767.5749459126396, 291.0503512057777, 227.4060484950132),
+    (-0.36965913545735024, 0.17414034009883844, 0.003915245015812422, 0.003666687416655559),
+    "radtan",
+)
+PUBLISHED_EVENT_CAMERA = Camera(
+    *SENSOR_SIZE,
+    *(560.8520948927032, 560.6295819972383, 313.00733235019237, 217.32858679842997),
+    (-0.09776467241921379, 0.2143738428636279, -0.004710710105172864, -0.004215916089401789),
+    "radtan",
+)
+PUBLISHED_EXTRINSICS = np.array(
+    [
+        [0.9998964430808897, -0.0020335804041023736, -0.014246672065022661, -0.00011238613157578769],
+        [0.001703024953250547, 0.9997299470300024, -0.023176123864880376, -0.0005981481496958399],
+        [0.014289955220253567, 0.02314946137886846, 0.9996298813149167, -0.004416681577516066],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Pose of the RGB camera in the axes of the event camera; these three are EDS's calibration, for when none is there."""
+
+Poses = tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]
+"""Times (ns), positions and quaternions."""
+
+
+def read(folder: Path) -> EventRecording:
+    """Reads all but the events, which are read when asked for.
+
+    The recording's zero of time is the earliest first stamp among events, frames and poses as unpacked, and that of the
+    files as prepared.
+
+    Args:
+        folder: With the files above.
+
+    Raises:
+        RecordingError: A file is missing or empty, anything in it cannot be used, or the files share no clock.
+    """
+    notes: list[str] = []
+    events = Hdf5Events(folder / "events.h5")
+    prepared, (pose_times, positions, quaternions) = _read_poses(folder, events, notes)
+    image_files, image_times = _read_image_list(folder, prepared, events, notes)
+    first_stamps = [events.first_time, pose_times[0], *image_times[:1]]
+    zero = 0 if prepared else int(min(first_stamps))
+    trajectory = Trajectory(pose_times - zero, positions, quaternions)
+
+    camchain = _find_camchain(folder)
+    rgb_camera, camera, event_from_rgb = PUBLISHED_RGB_CAMERA, PUBLISHED_EVENT_CAMERA, PUBLISHED_EXTRINSICS
+    if camchain is not None:
+        rgb_camera, camera, event_from_rgb = _read_camchain(camchain)
+    rectify_map_file = folder / "rectify_map_calib0.h5"
+    raw_events = not (prepared and rectify_map_file.exists())
+    if raw_events:
+        _check_lens(camera, camchain)
+    else:
+        undistorted = _read_undistorted_camera(folder, 1)
+        places = read_rectify_map(rectify_map_file, *SENSOR_SIZE).astype(float)
+        directions = (places - undistorted.matrix[:2, 2]) / undistorted.matrix[[0, 1], [0, 1]]
+        camera = replace(undistorted, model="lookup", directions=directions)
+    frames = None
+    if image_files:
+        if image_files[0].parent.name == PREPARED_IMAGES:
+            rgb_camera = _read_undistorted_camera(folder, 0)
+        for file in image_files:
+            check_image_size(file, rgb_camera.width, rgb_camera.height)
+        _check_lens(rgb_camera, camchain)
+        frames = Frames(image_files, image_times - zero, rgb_camera, trajectory.of_mounted(event_from_rgb))
+    if frames is not None or raw_events:
+        if camchain is None:
+            notes.append(
+                f"The published calibration of EDS is used, since no Kalibr camchain (*camchain*.yaml) lies in "
+                f"{folder.name} or in a calibration folder beside it."
+            )
+        elif camchain.parent != folder:
+            notes.append(f"The calibration is that of {camchain}.")
+    return EventRecording(
+        path=folder,
+        format="eds",
+        camera=camera,
+        trajectory=trajectory,
+        stream_events=lambda: events.stream(zero),
+        event_files=(events.path,),
+        frames=frames,
+        notes=notes,
+        locate_event=lambda index: f"{events.path}, event {index + 1}",
+        num_events=events.num_events,
+    )
+
+
+def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[bool, Poses]:
+    """Whether the events are on the clock of the prepared files, and the poses on this clock."""
+    found: dict[Path, Poses] = {}
+    notes_of: dict[Path, list[str]] = {}
+    for path, unit in ((folder / RAW_POSES, "s"), (folder / PREPARED_POSES, "us")):
+        if path.exists():
+            notes_of[path] = []
+            found[path] = read_poses(path, unit, notes_of[path])
+    if not found:
+        raise RecordingError(
+            f"{folder} holds neither {RAW_POSES} (t_s px py pz qx qy qz qw) nor {PREPARED_POSES}, which hold the poses "
+            "of the event camera; add one."
+        )
+    times = {path: poses[0] for path, poses in found.items()}
+    best = _on_the_clock_of(events, times)
+    if len(found) == 2:
+        raw_times, prepared_times = times.values()
+        _check_offset(folder, int(raw_times[0] - prepared_times[0]))
+        both = all(_overlap(events, rows) > 0 for rows in times.values())
+        if both and raw_times[0] > prepared_times[-1]:
+            raise RecordingError(
+                f"{events.path} holds times of {RAW_POSES} and of {PREPARED_POSES} in one, as a preparation that "
+                "was interrupted leaves them; unpack it again."
+            )
+        notes.append(
+            f"{RAW_POSES} and {PREPARED_POSES} are there; {best.name} is on the clock of events.h5 and is used."
+        )
+    notes += notes_of[best]
+    return best.name == PREPARED_POSES, found[best]
+
+
+def _check_offset(folder: Path, offset: int) -> None:
+    path = folder / "t_offset_us.txt"
+    if path.exists():
+        stated = int(read_times(path, "us")[0])
+        if abs(stated - offset) > OFFSET_TOLERANCE:
+            raise RecordingError(
+                f"{path} states {stated / 1000:.0f} µs between {RAW_POSES} and {PREPARED_POSES}, but their first times "
+                f"are {offset / 1000:.0f} µs apart; remove those that are not of this recording."
+            )
+
+
+def _read_image_list(
+    folder: Path, prepared: bool, events: Hdf5Events, notes: list[str]
+) -> tuple[tuple[Path, ...], Int64[np.ndarray, " images"]]:
+    """The images that are used, and their stamps on the clock of the events."""
+    folders = [folder / RAW_IMAGES, folder / PREPARED_IMAGES]
+    folders = [path for path in (reversed(folders) if prepared else folders) if path.is_dir()]
+    images = [tuple(sorted(path.glob("*.png")) or sorted(path.glob("*.jpg"))) for path in folders]
+    files = next(filter(None, images), ())
+    stamps = {folder / name: read_times(folder / name, "us") for name in STAMPS if (folder / name).exists()}
+    if not files and not stamps:
+        return (), np.zeros(0, np.int64)
+    if not folders:
+        notes.append(f"There are stamps of images, but no folder {RAW_IMAGES}/ or {PREPARED_IMAGES}/ with these.")
+        return (), np.zeros(0, np.int64)
+    if not stamps:
+        raise RecordingError(
+            f"{files[0].parent} holds {len(files):,} images, but {' and '.join(STAMPS)} are missing, one of which "
+            "holds their stamps (t_us); add it."
+        )
+    path = _on_the_clock_of(events, stamps)
+    if len(stamps[path]) != len(files):
+        raise RecordingError(
+            f"{files[0].parent if files else folders[0]} holds {len(files):,} images, but {path} holds "
+            f"{len(stamps[path]):,} stamps; give one each."
+        )
+    return files, stamps[path]
+
+
+def _overlap(events: Hdf5Events, times: Int64[np.ndarray, " rows"]) -> int:
+    """For how many ns there are both; below 0, how far they are apart."""
+    return int(min(times[-1], events.last_time) - max(times[0], events.first_time))
+
+
+def _on_the_clock_of(events: Hdf5Events, tables: dict[Path, Int64[np.ndarray, " rows"]]) -> Path:
+    """The file whose times (ns) overlap most with those of the events."""
+    best = max(tables, key=lambda path: _overlap(events, tables[path]))
+    if _overlap(events, tables[best]) < 0:
+        ranges = " and ".join(f"{path.name} times from {_span(rows[0], rows[-1])}" for path, rows in tables.items())
+        raise RecordingError(
+            f"{best.parent} holds {ranges}, but events.h5 times from {_span(events.first_time, events.last_time)}; "
+            f"they must be on one clock, in µs but for {RAW_POSES}, which is in seconds."
+        )
+    return best
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first * 1e-9:.6f} s to {last * 1e-9:.6f} s"
+
+
+def _find_camchain(folder: Path) -> Path | None:
+    """The first camchain in the folder or, without one, in the calibration folders beside it."""
+    places = [folder, *sorted(folder.parent.glob("*[cC]alib*/")), *sorted(folder.parent.glob("*[cC]alib*/*/"))]
+    return next((path for place in places for path in sorted(place.glob("*camchain*.yaml"))), None)
+
+
+def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
+    """The RGB camera, the event camera, and the pose of the first in the axes of the second."""
+    import yaml
+
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        camchain = yaml.safe_load(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}," if mark else ""
+        raise RecordingError(f"{path}{line} cannot be read as YAML, but a Kalibr camchain was expected.") from error
+    if not isinstance(camchain, dict) or not all(isinstance(camchain.get(name), dict) for name in ("cam0", "cam1")):
+        raise RecordingError(
+            f"{path} holds no cam0 and cam1, but the RGB and the event camera of a Kalibr camchain were expected."
+        )
+    cameras = {name: _kalibr_camera(path, name, camchain[name]) for name in ("cam0", "cam1")}
+    cam1_from_cam0 = _numbers(path, "cam1", camchain["cam1"], "T_cn_cnm1", (4, 4))
+    try:
+        check_rotation(cam1_from_cam0[:3, :3])
+    except ValueError as error:
+        raise RecordingError(f"{path} holds T_cn_cnm1 of cam1, whose rotation {error}; calibrate again.") from error
+    if not np.allclose(cam1_from_cam0[3], [0, 0, 0, 1]):
+        raise RecordingError(f"{path} holds T_cn_cnm1 of cam1, whose last row must be 0 0 0 1; calibrate again.")
+    if _event_camera(path, text, camchain) == "cam1":
+        rgb_camera, camera, event_from_rgb = cameras["cam0"], cameras["cam1"], cam1_from_cam0
+    else:
+        rgb_camera, camera, event_from_rgb = cameras["cam1"], cameras["cam0"], np.linalg.inv(cam1_from_cam0)
+    if (camera.width, camera.height) != SENSOR_SIZE:
+        raise RecordingError(
+            f"{path} calibrates an event camera of {camera.width} x {camera.height} pixels, but that of EDS has "
+            f"{SENSOR_SIZE[0]} x {SENSOR_SIZE[1]}; give the calibration of this recording."
+        )
+    return rgb_camera, camera, event_from_rgb
+
+
+def _event_camera(path: Path, text: str, camchain: dict) -> str:
+    """cam1, unless comments, topics, or the flip that is of RGB alone, say that it is cam0."""
+    said = set()
+    for name, other in (("cam0", "cam1"), ("cam1", "cam0")):
+        comment = re.search(rf"^{name}:[ \t]*#(.*)$", text, re.MULTILINE)
+        hint = f"{comment[1] if comment else ''} {camchain[name].get('rostopic')}".lower()
+        if "event" in hint or "dvs" in hint:
+            said.add(name)
+        if "rgb" in hint or camchain[name].get("flip") is True:
+            said.add(other)
+    if len(said) > 1:
+        raise RecordingError(
+            f"{path} says both of cam0 and of cam1 that it is the event camera (by comment, rostopic or flip), but one "
+            "is RGB; correct it."
+        )
+    return said.pop() if said else "cam1"
+
+
+def _kalibr_camera(path: Path, name: str, entry: dict) -> Camera:
+    model, distortion_model = (str(entry.get(key)).lower() for key in ("camera_model", "distortion_model"))
+    if model != "pinhole" or distortion_model not in KALIBR_MODELS:
+        raise RecordingError(
+            f"{path} holds camera_model {model} with distortion_model {distortion_model} of {name}, but pinhole with "
+            f"one of {', '.join(KALIBR_MODELS)} was expected."
+        )
+    fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", (4,)).tolist()
+    width, height = _numbers(path, name, entry, "resolution", (2,)).tolist()
+    if not (fx > 0 and fy > 0 and all(0 < size < 2**16 and size == int(size) for size in (width, height))):
+        raise RecordingError(
+            f"{path} holds focal lengths {fx:g} and {fy:g} and the resolution {width:g} x {height:g} of {name}, but "
+            "all must be above 0 (pixels), and the resolution whole."
+        )
+    camera = Camera(int(width), int(height), fx, fy, cx, cy)
+    if distortion_model == "none":
+        return camera
+    distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
+    return replace(camera, distortion=distortion, model=KALIBR_MODELS[distortion_model])
+
+
+def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        values = np.array(entry.get(key), dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        values = np.zeros(0)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise RecordingError(
+            f"{path} holds {key}: {str(entry.get(key))[:80]} of {name}, but {' x '.join(map(str, shape))} numbers were "
+            "expected."
+        )
+    return values
+
+
+def _check_lens(camera: Camera, camchain: Path | None) -> None:
+    """Whether each pixel, of a few over the whole image, sees one direction."""
+    width, height = camera.width // CHECKED_STEP + 1, camera.height // CHECKED_STEP + 1
+    lens = {name: getattr(camera, name) / CHECKED_STEP for name in ("fx", "fy", "cx", "cy")}
+    try:
+        replace(camera, width=width, height=height, **lens).pixel_directions()
+    except ValueError as error:
+        raise RecordingError(
+            f"{camchain} holds the {camera.model} distortion {camera.distortion}, which fits no lens, since it folds "
+            "the image; calibrate again."
+        ) from error
+
+
+def _read_undistorted_camera(folder: Path, number: int) -> Camera:
+    """Of the RGB (0) or the event camera (1) after the preparation."""
+    path = folder / "calib_undist_calib0.json"
+    try:
+        entry = json.loads(path.read_text())["intrinsics_undistorted"][number]
+        fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+    except FileNotFoundError as error:
+        raise RecordingError(
+            f"{path} is missing; intrinsics_undistorted of the RGB and the event camera was expected."
+        ) from error
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        raise RecordingError(
+            f"{path} cannot be read as JSON with intrinsics_undistorted, fx fy cx cy (pixels) of the RGB and the event "
+            "camera; prepare the recording again."
+        ) from error
+    if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
+        raise RecordingError(
+            f"{path} holds fx {fx:g}, fy {fy:g}, cx {cx:g} and cy {cy:g}, but finite numbers of pixels, and fx and fy "
+            "above 0, were expected."
+        )
+    return Camera(*SENSOR_SIZE, fx, fy, cx, cy)

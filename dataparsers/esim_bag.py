@@ -1,0 +1,205 @@
+"""Reader for the ROS bags of Robust e-NeRF's version of the simulator ESIM, as its data set is published.
+
+    esim.bag        ROS 1, with the topics
+        /cam0/events        dvs_msgs/EventArray
+        /cam0/pose          geometry_msgs/PoseStamped: camera to world, OpenCV axes, metres
+        /cam0/camera_info   sensor_msgs/CameraInfo
+    esim.conf       the simulator's flags, one a line (optional): contrast_threshold_pos, contrast_threshold_neg,
+                    refractory_period_ns and simulate_color_events, which means the Bayer pattern RGGB
+    views/          as of `esim_npz` (optional)
+
+Stamps are nanoseconds from the simulation's zero. All poses are used: the simulator states where the camera was at each
+sample of its inertial sensor and at each rendered image, both exact. (Robust e-NeRF keeps the former only, which are
+equally spaced, since it interpolates linearly.)
+
+To find the poses, the whole bag is read once. What a chunk of it holds is all that is in memory at once.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.esim_npz import checked_camera, checked_sensor, checked_trajectory, read_views, reading
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, RecordingError
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+FILES = ("esim.bag", "esim.conf")
+
+EVENTS, POSES, CAMERA = "/cam0/events", "/cam0/pose", "/cam0/camera_info"
+
+MESSAGE_TYPES = {
+    EVENTS: "dvs_msgs/msg/EventArray",
+    POSES: "geometry_msgs/msg/PoseStamped",
+    CAMERA: "sensor_msgs/msg/CameraInfo",
+}
+
+EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("polarity", "u1")])
+"""dvs_msgs/Event as it is serialized: 13 bytes."""
+
+COLOUR = "simulate_color_events"
+
+DEFAULT_FLAGS = {
+    "contrast_threshold_pos": "1.0",
+    "contrast_threshold_neg": "1.0",
+    "refractory_period_ns": "0",
+    COLOUR: "false",
+}
+"""Of the simulator; what esim.conf does not state is this."""
+
+TRUTH = {**dict.fromkeys(("1", "t", "true", "y", "yes"), True), **dict.fromkeys(("0", "f", "false", "n", "no"), False)}
+
+
+def read(folder: Path) -> EventRecording:
+    """Reads all but the events, which are read when asked for.
+
+    Args:
+        folder: With the files above.
+
+    Raises:
+        RecordingError: A file is missing or empty, anything in it cannot be used, or rosbags is not installed.
+    """
+    notes: list[str] = []
+    path = folder / "esim.bag"
+    trajectory = _read_trajectory(path, notes)
+    camera = _read_camera(path)
+    contrast_thresholds, refractory_period, bayer_pattern = None, 0, None
+    if (folder / "esim.conf").exists():
+        contrast_thresholds, refractory_period, bayer_pattern = _read_flags(folder / "esim.conf")
+    else:
+        notes.append(
+            "There is no esim.conf, so that contrast thresholds and refractory period are not known, and the sensor is "
+            "taken to be grey."
+        )
+    return EventRecording(
+        path=folder,
+        format="esim_bag",
+        camera=camera,
+        trajectory=trajectory,
+        stream_events=lambda: _stream_events(path),
+        event_files=(path,),
+        held_out_frames=read_views(folder, notes),
+        contrast_thresholds=contrast_thresholds,
+        refractory_period=refractory_period,
+        bayer_pattern=bayer_pattern,
+        notes=notes,
+        locate_event=lambda index: f"{path}, event {index + 1}",
+    )
+
+
+def _messages(path: Path, topic: str) -> Iterator[Any]:
+    """What was sent on a topic, in order of time: events as they are serialized, anything else as an object."""
+    try:
+        from rosbags.rosbag1 import Reader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise RecordingError(
+            f"{path} is a ROS bag, for which the package rosbags is missing; pip install 'enerf-ns[bag]'."
+        ) from error
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with reading(path, "a ROS 1 bag"), Reader(path) as bag:
+        connections = [connection for connection in bag.connections if connection.topic == topic]
+        if not connections:
+            found = ", ".join(sorted({connection.topic for connection in bag.connections})[:12])
+            raise RecordingError(f"{path} lacks the topic {topic}, and holds {found or 'none'}; record it as well.")
+        for connection in connections:
+            if connection.msgtype != MESSAGE_TYPES[topic]:
+                raise RecordingError(
+                    f"{path} holds messages of type {connection.msgtype} on {topic}, but {MESSAGE_TYPES[topic]} was "
+                    "expected."
+                )
+        for connection, _, data in bag.messages(connections):
+            yield data if topic == EVENTS else store.deserialize_ros1(data, connection.msgtype)
+
+
+def _read_trajectory(path: Path, notes: list[str]) -> Trajectory:
+    times, poses = [], []
+    for message in _messages(path, POSES):
+        stamp, position, orientation = message.header.stamp, message.pose.position, message.pose.orientation
+        times.append(stamp.sec * 10**9 + stamp.nanosec)
+        poses.append((position.x, position.y, position.z, orientation.x, orientation.y, orientation.z, orientation.w))
+    values = np.array(poses).reshape(-1, 7)
+    return checked_trajectory(path, np.array(times, np.int64), values[:, :3], values[:, 3:], notes)
+
+
+def _read_camera(path: Path) -> Camera:
+    info = next(_messages(path, CAMERA), None)
+    if info is None:
+        raise RecordingError(f"{path} holds no message on {CAMERA}, but the camera's calibration was expected.")
+    camera = checked_camera(path, info.width, info.height, info.K.reshape(3, 3), info.distortion_model, info.D)
+    events = next(_messages(path, EVENTS), None)
+    if events is None:
+        raise RecordingError(f"{path} holds no events; give a recording with some.")
+    (width, height), _ = _parse_events(path, events)
+    if (width, height) != (camera.width, camera.height):
+        raise RecordingError(
+            f"{path} holds a calibration for {camera.width} x {camera.height} pixels, but events of a sensor of "
+            f"{width} x {height}; give the calibration of the recording's own resolution."
+        )
+    return camera
+
+
+def _parse_events(path: Path, data: bytes) -> tuple[tuple[int, int], np.ndarray]:
+    """Width and height of the sensor, and its events, from a serialized dvs_msgs/EventArray.
+
+    Layout: u32 seq, u32 s, u32 ns, u32 length of the name of the frame, the name, u32 height, u32 width, u32 number of
+    events, and the events.
+    """
+    try:
+        (length,) = struct.unpack_from("<I", data, 12)
+        height, width, count = struct.unpack_from("<III", data, 16 + length)
+    except struct.error:
+        length, height, width, count = 0, 0, 0, -1
+    start = 28 + length
+    if len(data) != start + count * EVENT.itemsize:
+        raise RecordingError(
+            f"{path} holds a message on {EVENTS} whose {len(data):,} bytes are no dvs_msgs/EventArray; copy it again "
+            "from its source."
+        )
+    return (width, height), np.frombuffer(data, EVENT, count, start)
+
+
+def _stream_events(path: Path) -> Iterator[Events]:
+    held, num_held = [], 0
+    for message in _messages(path, EVENTS):
+        _, events = _parse_events(path, message)
+        held.append(events)
+        num_held += len(events)
+        if num_held >= EVENTS_AT_A_TIME:
+            yield _joined(held)
+            held, num_held = [], 0
+    if num_held:
+        yield _joined(held)
+
+
+def _joined(held: list[np.ndarray]) -> Events:
+    events = np.concatenate(held)
+    return Events(events["x"], events["y"], events["s"] * np.int64(10**9) + events["ns"], events["polarity"])
+
+
+def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
+    """Contrast thresholds, refractory period and Bayer pattern from a file of flags, of which the last one counts."""
+    with reading(path, "text"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+    flags = dict(DEFAULT_FLAGS)
+    for line in map(str.strip, lines):
+        name, _, value = line.lstrip("-").partition("=")
+        if line.startswith("-") and name.removeprefix("no") == COLOUR:
+            flags[COLOUR] = "false" if name.startswith("no") else value or "true"
+        elif line.startswith("-"):
+            flags[name] = value
+    numbers = []
+    for name in list(DEFAULT_FLAGS)[:3]:
+        try:
+            numbers.append(float(flags[name]))
+        except ValueError as error:
+            raise RecordingError(f"{path} holds --{name}={flags[name]}, where a number was expected.") from error
+    colour = TRUTH.get(flags[COLOUR].lower())
+    if colour is None:
+        raise RecordingError(f"{path} holds --{COLOUR}={flags[COLOUR]}, where true or false was expected.")
+    return checked_sensor(path, *numbers, "RGGB" if colour else "")

@@ -1,0 +1,501 @@
+"""Reader and writer of the layout for recordings of one's own, which a few lines of NumPy write, and `enerf convert`.
+
+    events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
+    poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
+    recording.json                   camera; and, optional, frame_camera, contrast_thresholds, refractory_period_ns,
+                                     bayer_pattern, depth_range
+    camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
+    frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
+                                     each exposure (optional)
+    blurred_frames/*.png             frames blurred by motion, with a stamps_ns.txt of their own (optional)
+    depth/*.npy                      (height, width) depth in metres of each sharp frame, 0 where nothing is (optional)
+
+All times are nanoseconds on one clock, from any zero.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from PIL import Image
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from enerf_ns.dataparsers.calibration import Camera, check_rotation
+from enerf_ns.dataparsers.recording import (
+    EVENTS_AT_A_TIME,
+    EventRecording,
+    Events,
+    Frames,
+    RecordingError,
+    check_image_size,
+    load_array,
+)
+from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
+
+OPTIONAL_KEYS = ("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "depth_range")
+CAMERA_KEYS = ("width", "height", "model", "fx", "fy", "cx", "cy")
+MOUNTING_KEY = "event_camera_from_frame_camera"
+
+COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5), "fisheye": (4,), "lookup": (0,)}
+"""How many numbers the distortion of each camera model may have."""
+
+STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
+
+LATEST = 2**62
+"""Times must be smaller than this many ns, 146 years, so that differences of two never overflow."""
+
+MOUNTING_TOLERANCE = 1e-6
+"""Metres, and entries of a rotation, by which a camera may move against the one that it is fixed to."""
+
+
+def read(folder: Path) -> EventRecording:
+    """Reads all but the events, which are read when asked for.
+
+    Args:
+        folder: With the files above.
+
+    Raises:
+        RecordingError: A file is missing or empty, or anything in it cannot be used.
+    """
+    notes: list[str] = []
+    columns = _open_columns(folder / "events")
+    path = folder / "recording.json"
+    about = read_json(path)
+    _check_keys(path, about, ("camera",), OPTIONAL_KEYS, "")
+    camera = parse_camera(path, "camera", about["camera"], folder / "camera_directions.npy")
+    trajectory = Trajectory(*read_poses(folder / "poses.txt", "ns", notes))
+    frame_camera, frame_trajectory = camera, trajectory
+    if "frame_camera" in about:
+        frame_camera, mounting = _parse_frame_camera(path, about["frame_camera"])
+        frame_trajectory = trajectory.of_mounted(mounting)
+    num_events = len(columns["t"])
+    return EventRecording(
+        path=folder,
+        format="event_recording",
+        camera=camera,
+        trajectory=trajectory,
+        stream_events=lambda: _stream_events(folder / "events", columns),
+        event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
+        frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, folder / "depth"),
+        blurred_frames=_read_frames(folder / "blurred_frames", frame_camera, frame_trajectory, None),
+        contrast_thresholds=_parse_two(
+            path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
+        ),
+        depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
+        refractory_period=_parse_refractory_period(path, about),
+        bayer_pattern=_parse_bayer_pattern(path, about),
+        notes=notes,
+        locate_event=lambda index: f"{folder / 'events'}, event {index + 1},",
+        num_events=num_events,
+    )
+
+
+def write(recording: EventRecording, folder: Path) -> int:
+    """Writes all events and poses of a recording, and its frames, calibration and depth; times stay as they are.
+
+    Args:
+        recording: Of any format.
+        folder: Exists and is empty.
+
+    Returns:
+        The number of events.
+
+    Raises:
+        RecordingError: An event lies outside the sensor, goes back in time or has no such polarity, or the frames'
+            camera is not fixed to the event camera.
+        OSError: The disk is full, or a frame cannot be copied.
+    """
+    about: dict[str, object] = {"camera": camera_json(recording.camera)}
+    kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
+    for frames in filter(None, kinds.values()):
+        frame_camera = _frame_camera_json(recording, frames)
+        if about.setdefault("frame_camera", frame_camera) != frame_camera:
+            raise RecordingError(
+                f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected."
+            )
+    about["contrast_thresholds"] = recording.contrast_thresholds
+    about["refractory_period_ns"] = recording.refractory_period or None
+    about["bayer_pattern"] = recording.bayer_pattern
+    about["depth_range"] = recording.depth_range
+    write_json(folder / "recording.json", {key: value for key, value in about.items() if value is not None})
+    if recording.camera.directions is not None:
+        np.save(folder / "camera_directions.npy", recording.camera.directions)
+    trajectory = recording.trajectory
+    write_poses(folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
+    for name, frames in kinds.items():
+        if frames is not None:
+            _write_frames(frames, folder / name, folder / "depth")
+
+    def locate(index: int) -> str:
+        return recording.locate_event(index) if recording.locate_event else f"{recording.path}, event {index + 1},"
+
+    size = recording.camera.width, recording.camera.height
+    return write_events(recording.stream_events(), folder / "events", *size, locate, recording.num_events)[0]
+
+
+def write_events(
+    stream: Iterator[Events],
+    folder: Path,
+    width: int,
+    height: int,
+    locate: Callable[[int], str],
+    total: int | None = None,
+) -> tuple[int, int]:
+    """Writes events piece by piece into x.npy, y.npy, t.npy and p.npy, and shows how many there are so far.
+
+    Args:
+        stream: In time order.
+        folder: New folder for the files.
+        width, height: Of the sensor, pixels.
+        locate: File and line of event number i, for error messages.
+        total: How many there are, where that is known.
+
+    Returns:
+        their number, and the time of the last one (ns).
+
+    Raises:
+        RecordingError: There are none, or one lies outside the sensor, goes back in time or has no such polarity.
+        OSError: The disk is full.
+    """
+    folder.mkdir()
+    num_events, last = 0, -LATEST
+    columns = (TextColumn("Writing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
+    with ExitStack() as stack:
+        files = {name: stack.enter_context(open(folder / f"{name}.npy", "wb")) for name in STORED_TYPES}
+        for name, file in files.items():
+            file.write(_npy_header(STORED_TYPES[name], 0))
+        with Progress(*columns, transient=True) as progress:
+            task = progress.add_task("", total=total)
+            for events in filter(len, stream):
+                _check_events(events, last, width, height, lambda i, before=num_events: locate(before + i))
+                num_events, last = num_events + len(events), int(events.t[-1])
+                for name, file in files.items():
+                    file.write(getattr(events, name).astype(STORED_TYPES[name]).tobytes())
+                progress.update(task, completed=num_events)
+        for name, file in files.items():
+            file.seek(0)
+            file.write(_npy_header(STORED_TYPES[name], num_events))
+    if num_events == 0:
+        raise RecordingError(f"{locate(0)} is missing, since there are no events; give a recording with some.")
+    return num_events, last
+
+
+def write_poses(path: Path, times: np.ndarray, positions: np.ndarray, quaternions: np.ndarray) -> None:
+    """Writes poses.txt so that reading it gives the same numbers.
+
+    Args:
+        path: The file.
+        times: int64 [poses] ns.
+        positions: float64 [poses, 3] metres.
+        quaternions: float64 [poses, 4], xyzw.
+    """
+    with open(path, "w") as file:
+        file.write("# t_ns px py pz qx qy qz qw\n")
+        for time, row in zip(times.tolist(), np.column_stack([positions, quaternions]).tolist(), strict=True):
+            file.write(f"{time} {' '.join(map(repr, row))}\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        RecordingError: The file is missing or holds no JSON object.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} is missing; a JSON file was expected there.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{path} cannot be read as JSON ({error}); write it again.") from error
+    if not isinstance(value, dict):
+        raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
+    return value
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Writes recording.json; numbers keep all their digits."""
+    path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+
+
+def camera_json(camera: Camera) -> dict[str, Any]:
+    """A camera as recording.json states it."""
+    about = {key: getattr(camera, key) for key in CAMERA_KEYS}
+    return {**about, "distortion": list(camera.distortion)} if camera.distortion else about
+
+
+def parse_camera(path: Path, name: str, value: object, directions_file: Path | None = None) -> Camera:
+    """A camera from its JSON object.
+
+    Args:
+        path: The JSON file.
+        name: Of the object in the file.
+        value: The object: width, height, model, fx, fy, cx, cy in pixels, and distortion where the model has it.
+        directions_file: Table of a camera of model lookup; None where there can be none.
+
+    Raises:
+        RecordingError: Something is missing, unknown or out of range, or fits no lens.
+    """
+    if not isinstance(value, dict):
+        raise RecordingError(
+            f"{path} holds {name} = {_short(value)}, but an object with {_list(CAMERA_KEYS)} was expected."
+        )
+    _check_keys(path, value, CAMERA_KEYS, ("distortion",), f" in {name}")
+    width, height = (_parse_int(path, f"{name}.{key}", value[key], 1, 65535) for key in ("width", "height"))
+    fx, fy, cx, cy = _numbers(
+        path, name, [value[key] for key in CAMERA_KEYS[3:]], (4,), "numbers fx, fy, cx, cy"
+    ).tolist()
+    if not (fx > 0 and fy > 0):
+        raise RecordingError(f"{path} holds the focal lengths {fx:g} and {fy:g}, but they must be above 0 (pixels).")
+    model = value["model"]
+    models = [known for known in COEFFICIENTS if known != "lookup" or directions_file is not None]
+    if model not in models:
+        raise RecordingError(f"{path} holds {name}.model = {_short(model)}, but one of {_list(models)} was expected.")
+    coefficients = value.get("distortion", [])
+    counts = COEFFICIENTS[model]
+    expected = f"{' or '.join(map(str, counts))} numbers, as the model {model} has,"
+    if not isinstance(coefficients, list) or len(coefficients) not in counts:
+        raise RecordingError(f"{path} holds {name}.distortion = {_short(coefficients)}, but {expected} were expected.")
+    if coefficients:
+        coefficients = _numbers(path, f"{name}.distortion", coefficients, (len(coefficients),), expected).tolist()
+    camera = Camera(width, height, fx, fy, cx, cy, tuple(coefficients), model)
+    if model == "lookup":
+        assert directions_file is not None
+        directions = load_array(directions_file)
+        if directions.shape != (height, width, 2) or not np.isfinite(directions).all():
+            raise RecordingError(
+                f"{directions_file} holds an array of shape {directions.shape}, but finite numbers of shape "
+                f"(height, width, 2) = {(height, width, 2)} were expected."
+            )
+        camera = replace(camera, directions=directions.astype(np.float64))
+    try:
+        camera.pixel_directions()
+    except ValueError as error:
+        raise RecordingError(f"{path} holds a {name} that fits no lens: {error}.") from error
+    return camera
+
+
+def _open_columns(folder: Path) -> dict[str, np.memmap]:
+    """The four files of events, of which only the headers are read."""
+    columns = {}
+    for name, stored in STORED_TYPES.items():
+        path = folder / f"{name}.npy"
+        column = load_array(path, mmap_mode="r")
+        kinds = "iub" if name == "p" else "iu"
+        if column.ndim != 1 or column.dtype.kind not in kinds:
+            raise RecordingError(
+                f"{path} holds an array of type {column.dtype} and shape {column.shape}, but one-dimensional whole "
+                f"numbers were expected; save them with .astype(np.{stored.__name__})."
+            )
+        columns[name] = column
+    if len({len(column) for column in columns.values()}) > 1:
+        lengths = ", ".join(f"{len(column):,} in {name}.npy" for name, column in columns.items())
+        raise RecordingError(f"{folder} holds columns of different lengths ({lengths}); give each event all four.")
+    if not len(columns["t"]):
+        raise RecordingError(f"{folder} holds no events; give a recording with some.")
+    return columns
+
+
+def _stream_events(folder: Path, columns: dict[str, np.memmap]) -> Iterator[Events]:
+    """The events that the files held when their headers were read."""
+    length = len(columns["t"])
+    for start in range(0, length, EVENTS_AT_A_TIME):
+        count = min(EVENTS_AT_A_TIME, length - start)
+        pieces = {name: _read_piece(folder / f"{name}.npy", column, start, count) for name, column in columns.items()}
+        t = pieces.pop("t")
+        if t.max() >= LATEST or t.min() <= -LATEST:
+            raise RecordingError(f"{folder / 't.npy'} holds the time {t.max()} ns, which is beyond 146 years.")
+        yield Events(t=t.astype(np.int64, copy=False), **pieces)
+
+
+def _read_piece(path: Path, column: np.memmap, start: int, count: int) -> np.ndarray:
+    """Some rows of a column; by reading and not by mapping, so that a file that shrinks is noticed."""
+    try:
+        piece = np.fromfile(path, column.dtype, count, offset=column.offset + start * column.dtype.itemsize)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error}); copy it again from its source.") from error
+    if len(piece) < count:
+        raise RecordingError(f"{path} became shorter while it was read; read the recording again.")
+    return piece.astype(column.dtype.newbyteorder("="), copy=False)
+
+
+def _check_events(events: Events, last: int, width: int, height: int, locate: Callable[[int], str]) -> None:
+    limits = (("x", events.x, 0, width - 1), ("y", events.y, 0, height - 1), ("polarity", events.p, -1, 1))
+    for name, column, smallest, largest in limits:
+        bad = (column < smallest) | (column > largest)
+        if bad.any():
+            index = int(np.argmax(bad))
+            raise RecordingError(
+                f"{locate(index)} holds {name} = {column[index]}, but from {smallest} to {largest} was expected, on a "
+                f"sensor of {width} x {height} pixels."
+            )
+    backwards = np.diff(events.t, prepend=last) < 0
+    if backwards.any():
+        index = int(np.argmax(backwards))
+        before = events.t[index - 1] if index else last
+        raise RecordingError(
+            f"{locate(index)} goes back in time from {before} ns to {events.t[index]} ns, but events must be in time "
+            "order; sort them."
+        )
+
+
+def _npy_header(dtype: type, length: int) -> bytes:
+    """Of a .npy file with one column, always 128 bytes, so that the length can be filled in at the end."""
+    header = f"{{'descr': '{np.dtype(dtype).str}', 'fortran_order': False, 'shape': ({length},), }}"
+    return b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little") + header.ljust(117).encode() + b"\n"
+
+
+def _parse_frame_camera(path: Path, value: object) -> tuple[Camera, Float64[np.ndarray, "4 4"]]:
+    """The camera of the frames, and its pose in the axes of the event camera."""
+    if not isinstance(value, dict) or MOUNTING_KEY not in value:
+        return parse_camera(path, "frame_camera", value), np.eye(4)
+    name = f"frame_camera.{MOUNTING_KEY}"
+    mounting = _numbers(path, name, value[MOUNTING_KEY], (4, 4), "a matrix of 4 x 4 numbers")
+    try:
+        check_rotation(mounting[:3, :3])
+    except ValueError as error:
+        raise RecordingError(f"{path} holds a {name} whose upper left 3 x 3 part {error}.") from error
+    if (mounting[3] != [0, 0, 0, 1]).any():
+        raise RecordingError(
+            f"{path} holds a {name} whose last row is {mounting[3].tolist()}, but 0 0 0 1 was expected."
+        )
+    camera = {key: item for key, item in value.items() if key != MOUNTING_KEY}
+    return parse_camera(path, "frame_camera", camera), mounting
+
+
+def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, Any] | None:
+    """The frames' camera as recording.json states it; None where it is the event camera."""
+    body, mounted = recording.trajectory, frames.trajectory
+    if mounted is body and frames.camera == recording.camera:
+        return None
+    times = torch.from_numpy(mounted.times[body.covers(mounted.times)])
+    bodies, cameras = body.poses(times).numpy(), mounted.poses(times).numpy()
+    inverses = bodies[:, :, :3].transpose(0, 2, 1)
+    mountings = inverses @ (cameras - np.pad(bodies[:, :, 3:], ((0, 0), (0, 0), (3, 0))))
+    if not len(mountings) or np.abs(mountings - mountings[0]).max() > MOUNTING_TOLERANCE:
+        raise RecordingError(
+            f"{recording.path} holds frames of a camera that moves against the event camera, but this layout has one "
+            "pose for both and the extrinsics between them."
+        )
+    if frames.camera.model == "lookup":
+        raise RecordingError(
+            f"{recording.path} holds frames of a camera with a table of directions, but this layout has such a table "
+            "for the event camera alone."
+        )
+    return {**camera_json(frames.camera), MOUNTING_KEY: [*mountings[0].tolist(), [0.0, 0.0, 0.0, 1.0]]}
+
+
+def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, depth_folder: Path | None) -> Frames | None:
+    stamps_file = folder / "stamps_ns.txt"
+    kinds = Image.registered_extensions()
+    files = tuple(sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds))
+    if not files and not stamps_file.exists():
+        return None
+    times = read_times(stamps_file, "ns")
+    if len(times) != len(files):
+        raise RecordingError(
+            f"{folder} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; give one each."
+        )
+    for file in files:
+        check_image_size(file, camera.width, camera.height)
+    depth_files = tuple(sorted(depth_folder.glob("[!.]*.npy"))) if depth_folder else ()
+    if not depth_files:
+        return Frames(files, times, camera, trajectory)
+    if len(depth_files) != len(files):
+        raise RecordingError(
+            f"{depth_folder} holds {len(depth_files)} depth maps, but {folder} holds {len(files)} images."
+        )
+    for file in depth_files:
+        shape = load_array(file, mmap_mode="r").shape
+        if shape != (camera.height, camera.width):
+            raise RecordingError(
+                f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
+                f"{(camera.height, camera.width)}."
+            )
+    return Frames(files, times, camera, trajectory, depth_files)
+
+
+def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
+    """Copies frames and their depth; names are their numbers, so that they sort as they were."""
+    folder.mkdir()
+    digits = max(5, len(str(frames.numbers[-1])))
+    names = [f"{number:0{digits}d}" for number in frames.numbers.tolist()]
+    for name, source in zip(names, frames.filenames, strict=True):
+        shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
+    (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
+    if frames.depth_filenames and folder.name == "frames":
+        depth_folder.mkdir()
+        for name, source in zip(names, frames.depth_filenames, strict=True):
+            shutil.copyfile(source, depth_folder / f"{name}.npy")
+
+
+def _check_keys(path: Path, value: dict, required: tuple[str, ...], optional: tuple[str, ...], where: str) -> None:
+    missing = [key for key in required if key not in value]
+    if missing:
+        raise RecordingError(f"{path} lacks {_list(missing)}{where}; add it, as the layout event_recording asks for.")
+    unknown = [key for key in value if key not in required + optional]
+    if unknown:
+        raise RecordingError(
+            f"{path} holds the unknown key {unknown[0]!r}{where}; known are {_list(required + optional)}."
+        )
+
+
+def _parse_two(path: Path, about: dict, name: str, expected: str) -> tuple[float, float] | None:
+    if name not in about:
+        return None
+    first, second = _numbers(path, name, about[name], (2,), expected).tolist()
+    if not (first > 0 and second > 0) or (name == "depth_range" and first >= second):
+        raise RecordingError(f"{path} holds {name} = {_short(about[name])}, but {expected} were expected.")
+    return first, second
+
+
+def _parse_refractory_period(path: Path, about: dict) -> int:
+    return _parse_int(path, "refractory_period_ns", about.get("refractory_period_ns", 0), 0, 10**12)
+
+
+def _parse_bayer_pattern(path: Path, about: dict) -> str | None:
+    pattern = about.get("bayer_pattern")
+    if pattern is not None and not (isinstance(pattern, str) and len(pattern) == 4 and set(pattern) <= set("RGB")):
+        raise RecordingError(
+            f"{path} holds bayer_pattern = {_short(pattern)}, but the colours of the pixels (0, 0), (1, 0), (0, 1) and "
+            "(1, 1) were expected, such as RGGB."
+        )
+    return pattern
+
+
+def _parse_int(path: Path, name: str, value: object, smallest: int, largest: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not smallest <= value <= largest:
+        raise RecordingError(
+            f"{path} holds {name} = {_short(value)}, but a whole number from {smallest} to {largest} was expected."
+        )
+    return value
+
+
+def _numbers(path: Path, name: str, value: object, shape: tuple[int, ...], expected: str) -> Float64[np.ndarray, "..."]:
+    try:
+        array = np.array(value)
+    except ValueError:  # lists of different lengths
+        array = np.array(None)
+    if array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
+        raise RecordingError(f"{path} holds {name} = {_short(value)}, but {expected} were expected.")
+    return array.astype(np.float64)
+
+
+def _list(names: tuple[str, ...] | list[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."

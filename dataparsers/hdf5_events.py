@@ -1,0 +1,227 @@
+"""Events in HDF5 files of the layout of DSEC, TUM-VIE and EDS: whole microseconds, and one dataset a column.
+
+    x, y        integers, pixels
+    t           integers, µs
+    p           integers or booleans, polarity
+    t_offset    one integer, µs, to be added to every time (optional, at the root)
+
+The columns lie in the group events/ or at the root. Rectify maps, which come beside such files, are read here as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float32
+
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events, RecordingError
+
+if TYPE_CHECKING:
+    import h5py
+
+COLUMNS = ("x", "y", "t", "p")
+
+LATEST = 2**62 // 1000
+"""µs; what lies beyond (146 years) does not fit into 64 bits of nanoseconds, or is no µs."""
+
+SMALLEST_CACHE = 2**20
+"""Bytes for chunks that were decompressed and are not yet used up."""
+
+
+class Hdf5Events:
+    """The events of a file, looked at once, and read in pieces later.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RecordingError: The file is missing, truncated or no HDF5, lacks a column, is empty, has columns of another type
+            or of different lengths, or is compressed by a filter that is not available.
+    """
+
+    path: Path
+    num_events: int
+    """When the file was looked at; what is appended later does not count."""
+    first_time: int
+    """ns, on the clock of the file."""
+    last_time: int
+    """ns, on the clock of the file."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._cache = SMALLEST_CACHE
+        with _reading(path, "events"), self._open() as file:
+            columns = self._columns(file)
+            self._check(columns)
+            self._offset = self._read_offset(file)
+            self._cache = max(SMALLEST_CACHE, *(_chunk_bytes(column) for column in columns.values()))
+            self.num_events = len(columns["t"])
+            self.first_time = int(self._times(columns["t"], 0, 1, 0)[0])
+            self.last_time = int(self._times(columns["t"], self.num_events - 1, self.num_events, 0)[0])
+
+    def stream(self, zero: int) -> Iterator[Events]:
+        """The events that were there when the file was looked at, in file order, `EVENTS_AT_A_TIME` at once.
+
+        Args:
+            zero: Time (ns, on the clock of the file) that becomes 0.
+
+        Raises:
+            RecordingError: The file cannot be read any more, or has fewer events than before.
+        """
+        with _reading(self.path, "events"):
+            file = self._open()
+        with file:
+            with _reading(self.path, "events"):
+                columns = self._columns(file)
+            for start in range(0, self.num_events, EVENTS_AT_A_TIME):
+                stop = min(start + EVENTS_AT_A_TIME, self.num_events)
+                with _reading(self.path, f"events {start + 1:,} to {stop:,}"):
+                    x, y, p = (columns[name][start:stop] for name in ("x", "y", "p"))
+                    t = self._times(columns["t"], start, stop, zero)
+                if not len(x) == len(y) == len(t) == len(p) == stop - start:
+                    raise RecordingError(
+                        f"{self.path} held {self.num_events:,} events and holds fewer now; wait until it is written, "
+                        "then read it again."
+                    )
+                yield Events(x, y, t, p)
+
+    def _open(self) -> h5py.File:
+        import h5py
+        import hdf5plugin  # noqa: F401  makes the filters known
+
+        return h5py.File(self.path, "r", locking=False, rdcc_nbytes=self._cache, rdcc_w0=1.0)
+
+    def _columns(self, file: h5py.File) -> dict[str, h5py.Dataset]:
+        import h5py
+
+        group = file["events"] if "events" in file else file
+        if not isinstance(group, h5py.Group):
+            raise RecordingError(
+                f"{self.path} holds a dataset events, but a group of the datasets x, y, t, p was expected."
+            )
+        missing = [name for name in COLUMNS if not isinstance(group.get(name), h5py.Dataset)]
+        if missing:
+            where = "its group events/" if group.name == "/events" else "its root"
+            raise RecordingError(
+                f"{self.path} lacks the dataset{'s' * (len(missing) > 1)} {', '.join(missing)} in {where}; events are "
+                "the datasets x, y, t, p in a group events/ or at the root."
+            )
+        return {name: group[name] for name in COLUMNS}  # type: ignore[misc]
+
+    def _check(self, columns: dict[str, h5py.Dataset]) -> None:
+        for name, column in columns.items():
+            if column.dtype.kind not in ("iub" if name == "p" else "iu"):
+                expected = "whole microseconds (integers)" if name == "t" else "integers"
+                raise RecordingError(f"{self.path} holds {name} as {column.dtype}, but {expected} were expected.")
+            if column.ndim != 1:
+                raise RecordingError(
+                    f"{self.path} holds {name} as an array of shape {column.shape}, but one number an event was "
+                    "expected."
+                )
+            _check_filters(self.path, column)
+        lengths = {name: len(column) for name, column in columns.items()}
+        if len(set(lengths.values())) > 1:
+            found = ", ".join(f"{length:,} {name}" for name, length in lengths.items())
+            raise RecordingError(f"{self.path} holds {found}, but as many of each were expected; copy it again.")
+        if lengths["t"] == 0:
+            raise RecordingError(f"{self.path} holds no events; give a recording with some.")
+
+    def _read_offset(self, file: h5py.File) -> int:
+        if "t_offset" not in file:
+            return 0
+        offset = np.asarray(file["t_offset"])
+        if offset.dtype.kind not in "iu" or offset.size != 1:
+            raise RecordingError(
+                f"{self.path} holds t_offset as {offset.dtype} of shape {offset.shape}, but one integer (µs) was "
+                "expected."
+            )
+        return int(offset.reshape(()))
+
+    def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
+        """Nanoseconds from `zero`."""
+        times = column[start:stop]
+        extremes = (int(times.min()) + self._offset, int(times.max()) + self._offset) if len(times) else ()
+        if any(abs(time) >= LATEST for time in extremes):
+            raise RecordingError(
+                f"{self.path} holds the time {max(extremes, key=abs)} µs, which is beyond 146 years; times were "
+                "expected in microseconds."
+            )
+        times = times.astype(np.int64)
+        times *= 1000
+        times += self._offset * 1000 - zero
+        return times
+
+
+def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray, "height width 2"]:
+    """Where each pixel of a camera lies in its undistorted image: x and y in pixels.
+
+    Args:
+        path: HDF5 file with the dataset rectify_map.
+        width, height: Of the sensor, pixels.
+
+    Raises:
+        RecordingError: The file is missing, truncated or no HDF5, or holds no such map of this size.
+    """
+    import h5py
+    import hdf5plugin  # noqa: F401  makes the filters known
+
+    with _reading(path, "a rectify map"), h5py.File(path, "r", locking=False) as file:
+        dataset = file.get("rectify_map")
+        if not isinstance(dataset, h5py.Dataset):
+            raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
+        if dataset.dtype.kind != "f" or dataset.shape != (height, width, 2):
+            raise RecordingError(
+                f"{path} holds rectify_map as {dataset.dtype} of shape {dataset.shape}, but floats of shape "
+                f"{(height, width, 2)} were expected: x, y of each pixel of the sensor."
+            )
+        _check_filters(path, dataset)
+        rectify_map = dataset[...].astype(np.float32)
+    if not np.isfinite(rectify_map).all():
+        raise RecordingError(f"{path} holds a rectify_map with numbers that are not finite; make it again.")
+    if not (np.diff(rectify_map[..., 0], axis=1).min() > 0 and np.diff(rectify_map[..., 1], axis=0).min() > 0):
+        raise RecordingError(
+            f"{path} holds a rectify_map whose x does not increase along rows or whose y does not down columns, as "
+            "those of a camera do; make it again."
+        )
+    return rectify_map
+
+
+def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
+    import h5py
+
+    properties = dataset.id.get_create_plist()
+    for i in range(properties.get_nfilters()):
+        number, _, _, name = properties.get_filter(i)
+        if not h5py.h5z.filter_avail(number):
+            called = f" ({name.decode(errors='replace')})" if name else ""
+            raise RecordingError(
+                f"{path} is compressed by the HDF5 filter {number}{called}, which is neither in h5py nor in "
+                "hdf5plugin; install its plugin and set HDF5_PLUGIN_PATH, or repack the file without it."
+            )
+
+
+def _chunk_bytes(dataset: h5py.Dataset) -> int:
+    return dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
+
+
+@contextmanager
+def _reading(path: Path, what: str) -> Iterator[None]:
+    """Turns errors of the HDF5 library into one sentence about the file."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} is missing; an HDF5 file with {what} was expected there.") from error
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
+        if path.is_file() and path.stat().st_size == 0:
+            raise RecordingError(f"{path} is empty; an HDF5 file with {what} was expected.") from error
+        lines = str(error).strip("\"'").splitlines()
+        reason = lines[0].rstrip(".") if lines else type(error).__name__
+        raise RecordingError(
+            f"{path} cannot be read as an HDF5 file with {what} ({reason}); copy it again from its source."
+        ) from error

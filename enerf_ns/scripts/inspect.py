@@ -1,0 +1,425 @@
+"""`enerf inspect`: what a recording holds and what is wrong with it, in the terminal and as a page of pictures."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import html
+import io
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float64, Int64, UInt8
+from PIL import Image
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.events import event_picture
+from enerf_ns.dataparsers.inspection import (
+    EventStatistics,
+    Problem,
+    event_statistics,
+    find_problems,
+    pose_gaps,
+    unusual_rates,
+)
+from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, load_image, read_recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CONSOLE = Console(width=120)
+
+NUM_INSTANTS = 6
+"""At which events are shown, beside the frames of the same times."""
+NUM_FRUSTA = 16
+"""Cameras drawn along the trajectory."""
+PICTURE_WIDTH = 640
+"""Pixels of a picture on the page, at most."""
+NAMED_HOT_PIXELS = 8
+"""Listed one by one; the heat map marks all."""
+
+BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
+
+
+@dataclass
+class Inspect:
+    """Look at a recording before training: what was found, numbers, problems, and a page of pictures."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Folder of the recording. It is only ever read."""
+    output: Path | None = None
+    """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
+    event_camera: Literal["left", "right"] | None = None
+    """Which of TUM-VIE's two event cameras. None: left."""
+
+    def main(self) -> None:
+        data = self.data.expanduser().resolve()
+        output = (self.output or Path(f"inspect-{data.name}.html")).expanduser().resolve()
+        if output.is_dir():
+            raise RecordingError(f"--output {output} is a folder; give the name of an HTML file.")
+        if output.is_relative_to(data):
+            raise RecordingError(
+                f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
+            )
+        if self.event_camera is None:
+            recording = read_recording(data)
+        else:
+            recording = read_recording(data, "tum_vie", event_camera=self.event_camera)
+        inspection = Inspection.of(recording)
+        inspection.print_tables()
+        _write(output, inspection.page())
+        CONSOLE.print(f"Pictures are in {output}", soft_wrap=True, highlight=False, markup=False)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A recording with all that was found out about it."""
+
+    recording: EventRecording
+    statistics: EventStatistics
+    depth_range: tuple[float, float] | None
+    """Metres; None where it is neither stated nor can be measured."""
+    problems: list[Problem]
+
+    @classmethod
+    def of(cls, recording: EventRecording) -> Inspection:
+        """Counts events, looks for problems and measures the depth of the scene.
+
+        Raises:
+            RecordingError: The events cannot be used.
+        """
+        from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, depth_range
+
+        statistics = event_statistics(recording)
+        near_far, unknown = None, []
+        try:
+            near_far = depth_range(recording, EventDataParserConfig())
+        except RecordingError as error:
+            unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
+        return cls(recording, statistics, near_far, find_problems(recording, near_far) + unknown)
+
+    def print_tables(self) -> None:
+        """What was found, numbers, and problems in red, on the terminal."""
+        for title, rows in (("Recording", self.found()), ("Numbers", self.numbers())):
+            table = Table(title=title, show_header=False, title_justify="left")
+            for name, value in rows.items():
+                table.add_row(name, escape(value))
+            CONSOLE.print(table)
+        for note in self.recording.notes:
+            CONSOLE.print(f"[yellow]note: {escape(note)}[/yellow]", highlight=False)
+        CONSOLE.print(problems_table(self.problems))
+
+    def found(self) -> dict[str, str]:
+        """What the reader found, by name."""
+        recording, (first, *_, last) = self.recording, self.statistics.edges
+        times = recording.trajectory.times
+        interval = float(np.median(np.diff(times))) * 1e-9
+        rows = {
+            "format": recording.format,
+            "events": f"{self.statistics.num_events:,}, {_span(first, last)}",
+            "poses": f"{len(times):,}, {_span(times[0], times[-1])}, usually every {1e3 * interval:.3g} ms",
+        }
+        for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
+            rows[name] = "none"
+            if frames is not None:
+                depth = ", with depth" if frames.depth_filenames else ""
+                rows[name] = f"{len(frames.times):,}, {_span(frames.times[0], frames.times[-1])}{depth}"
+        rows["event camera"] = _camera(recording.camera)
+        frames = recording.frames or recording.blurred_frames
+        if frames is not None:
+            rows["frame camera"] = "the same" if frames.camera == recording.camera else _camera(frames.camera)
+            rows["extrinsics"] = _extrinsics(recording, frames)
+        rows["thresholds"] = (
+            "{:.3g} on, {:.3g} off".format(*recording.contrast_thresholds)
+            if recording.contrast_thresholds
+            else "not stated"
+        )
+        if recording.refractory_period:
+            rows["refractory"] = f"{recording.refractory_period * 1e-3:g} µs"
+        rows["colours"] = recording.bayer_pattern or "none: a grey sensor"
+        return rows
+
+    def numbers(self) -> dict[str, str]:
+        """What was counted and measured, by name."""
+        from enerf_ns.dataparsers.event_dataparser import scene_normalisation
+
+        recording, statistics = self.recording, self.statistics
+        gaps = pose_gaps(recording, statistics)
+        missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
+        path = self._path(1000)[1][:, :, 3]
+        hot = recording.index.hot_pixels.numpy()
+        width = recording.camera.width
+        places = ", ".join(f"({pixel % width}, {pixel // width})" for pixel in hot[:NAMED_HOT_PIXELS])
+        more = f" and {len(hot) - NAMED_HOT_PIXELS} more" if len(hot) > NAMED_HOT_PIXELS else ""
+        rows = {
+            "event rate": f"{_round(statistics.num_events / statistics.seconds)} a second, "
+            f"{_round(statistics.rate.max())} at most",
+            "a pixel": f"{statistics.events_per_pixel:.3g} events; "
+            f"{100 * statistics.share_below_two:.1f} % of the pixels have fewer than two",
+            "polarity": f"{100 * statistics.num_on / statistics.num_events:.1f} % on, "
+            f"{100 * statistics.num_off / statistics.num_events:.1f} % off",
+            "implied ratio": f"C_on = {statistics.threshold_ratio:.3g} C_off, if it brightens as much as it darkens"
+            if statistics.num_on and statistics.num_off
+            else "unknown, without both polarities",
+            "hot pixels": f"{len(hot):,} left out, (x, y) = {places}{more}" if len(hot) else "none left out",
+            "pose coverage": f"{100 * (1 - missing):.3g} % of the events' time"
+            + (f", {len(gaps)} gap{'s' * (len(gaps) > 1)}" if len(gaps) else ", no gaps"),
+            "path": f"{np.nansum(np.linalg.norm(np.diff(path, axis=0), axis=1)):.3g} m long, "
+            f"spans {np.linalg.norm(np.nanmax(path, axis=0) - np.nanmin(path, axis=0)):.3g} m",
+        }
+        if self.depth_range:
+            near, far = self.depth_range
+            source = "stated" if recording.depth_range else "measured from the events"
+            _, scale, box = scene_normalisation(recording, near, far)
+            sides = " x ".join(f"{side:.3g}" for side in (box[1] - box[0]) / scale)
+            rows["near and far"] = f"{near:.3g} m and {far:.3g} m, {source}"
+            rows["box"] = f"{sides} m, all that the camera sees; 1 m is {scale:.3g} in Nerfstudio"
+        else:
+            rows["near and far"] = rows["box"] = "unknown"
+        return rows
+
+    def page(self) -> str:
+        """One HTML file with all pictures in it."""
+        frames = self.recording.frames or self.recording.blurred_frames
+        return Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8")).substitute(
+            name=html.escape(self.recording.path.name),
+            path=html.escape(str(self.recording.path)),
+            problems=_problem_box(self.problems),
+            found=_html_table(self.found(), self.recording.notes),
+            numbers=_html_table(self.numbers()),
+            timeline=_plot(self.timeline(), "events, frames and poses, and the event rate over time"),
+            instants_title="Events" if frames is None else "Frames, and events at the same time, undistorted",
+            instants_width="300px" if frames is None else "420px",
+            instants=self._instants(frames),
+            trajectory=_plot(self.trajectory(), "trajectory with frusta, seen from above"),
+            heat_map=_plot(self.heat_map(), "number of events of each pixel"),
+        )
+
+    def timeline(self) -> Figure:
+        """When there are events, frames and poses; below, the event rate, with silences and bursts in red."""
+        from matplotlib.figure import Figure
+
+        recording, statistics = self.recording, self.statistics
+        edges = statistics.edges * 1e-9
+        figure = Figure(figsize=(11.4, 4.2), layout="constrained", dpi=150)
+        coverage, rate = figure.subplots(2, 1, sharex=True, height_ratios=[1, 2.6])
+        coverage.barh(2, edges[-1] - edges[0], left=edges[0], height=0.55, color=BLUE)
+        frames = recording.frames or recording.blurred_frames
+        if frames is not None:
+            coverage.vlines(frames.times * 1e-9, 0.72, 1.28, color=GREEN, linewidth=0.8)
+        else:
+            coverage.text(0.5 * (edges[0] + edges[-1]), 1, "no frames", color=GREY, ha="center", va="center")
+        poses = recording.trajectory
+        coverage.barh(0, (poses.end - poses.start) * 1e-9, left=poses.start * 1e-9, height=0.55, color=GREY)
+        for begin, end in pose_gaps(recording, statistics) * 1e-9:
+            coverage.barh(0, end - begin, left=begin, height=0.55, color=RED)
+        coverage.set_yticks([0, 1, 2], ["poses", "frames", "events"])
+        coverage.set_ylim(-0.5, 2.5)
+        coverage.tick_params(axis="both", length=0)
+        coverage.spines[:].set_visible(False)
+
+        rate.stairs(statistics.rate / 1e6, edges, fill=True, color=BLUE, alpha=0.35)
+        rate.stairs(statistics.rate / 1e6, edges, color=BLUE, linewidth=0.8, baseline=None)
+        silences, bursts = unusual_rates(recording, statistics, self.depth_range)
+        for begin, end in np.concatenate([silences, bursts]) * 1e-9:
+            rate.axvspan(begin, end, color=RED, alpha=0.35)
+        calm = ~((statistics.edges[:-1, None] >= bursts[:, 0]) & (statistics.edges[:-1, None] < bursts[:, 1])).any(1)
+        rate.set_xlabel("seconds on the clock of the recording")
+        rate.set_ylabel("million events per second")
+        rate.set_ylim(0, 1.1 * statistics.rate[calm].max() / 1e6)
+        rate.set_xlim(min(edges[0], poses.start * 1e-9), max(edges[-1], poses.end * 1e-9))
+        rate.spines[["top", "right"]].set_visible(False)
+        return figure
+
+    def trajectory(self) -> Figure:
+        """The path, the view of some cameras and the box, along the mean up direction of the cameras."""
+        from matplotlib.figure import Figure
+
+        from enerf_ns.dataparsers.event_dataparser import scene_normalisation
+
+        transform, scale, box = scene_normalisation(self.recording, *(self.depth_range or (1.0, 2.0)))
+        from_above = transform[:2, :3]
+        times, poses = self._path(1000)
+        places = poses[:, :, 3] @ from_above.T
+        low, high = (box / scale - transform[:, 3])[:, :2]
+        size = (np.nanmax(places, axis=0) - np.nanmin(places, axis=0)).max()
+        figure = Figure(figsize=(5.6, 5.0), layout="constrained", dpi=150)
+        axis = figure.subplots()
+        if self.depth_range:
+            axis.add_patch(_rectangle(low, high))
+            size = max(size, (high - low).max())
+
+        camera = self.recording.camera.undistorted()
+        right, below = camera.width - camera.cx, camera.height - camera.cy
+        x = np.array([-camera.cx, right, right, -camera.cx, -camera.cx]) / camera.fx
+        y = np.array([-camera.cy, -camera.cy, below, below, -camera.cy]) / camera.fy
+        corners = np.stack([x, y, np.ones(5)], axis=1)
+        chosen = np.linspace(0, len(times) - 1, NUM_FRUSTA).round().astype(int)
+        path = axis.scatter(*places.T, c=times * 1e-9, s=6, cmap="viridis", zorder=3)
+        for i in chosen[~np.isnan(places[chosen, 0])]:
+            ends = (corners * 0.1 * size @ poses[i, :, :3].T + poses[i, :, 3]) @ from_above.T
+            colour = path.to_rgba(times[i] * 1e-9)
+            axis.plot(*ends.T, color=colour, linewidth=0.9)
+            for end in ends[:4]:
+                axis.plot(*np.stack([places[i], end]).T, color=colour, linewidth=0.9)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.margins(0.06)
+        axis.set_xlabel("metres" + "; dashed: the box" * bool(self.depth_range))
+        axis.spines[["top", "right"]].set_visible(False)
+        figure.colorbar(path, ax=axis, label="seconds", shrink=0.8)
+        return figure
+
+    def heat_map(self) -> Figure:
+        """Events of each pixel on a logarithmic scale; hot pixels are circled."""
+        from matplotlib import colormaps
+        from matplotlib.colors import LogNorm
+        from matplotlib.figure import Figure
+
+        counts, width = self.statistics.counts, self.recording.camera.width
+        figure = Figure(figsize=(5.6, 5.0), layout="constrained", dpi=150)
+        axis = figure.subplots()
+        colours = colormaps["inferno"].with_extremes(bad="#c9ced8")
+        shown = axis.imshow(np.ma.masked_equal(counts, 0), cmap=colours, norm=LogNorm(1, max(int(counts.max()), 2)))
+        hot = self.recording.index.hot_pixels.numpy()
+        if len(hot):
+            axis.scatter(hot % width, hot // width, s=40, facecolors="none", edgecolors="#22c7e8", linewidths=1.2)
+        axis.set_xlabel("grey: none" + "; circled: hot, left out" * bool(len(hot)))
+        figure.colorbar(shown, ax=axis, label="events", location="bottom", shrink=0.8)
+        return figure
+
+    def _path(self, number: int) -> tuple[Int64[np.ndarray, " number"], Float64[np.ndarray, "number 3 4"]]:
+        """Times and poses while there are events; not a number within gaps between poses."""
+        first, last = self.statistics.edges[[0, -1]]
+        times = np.linspace(first, last, number).astype(np.int64)
+        poses = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()
+        for begin, end in pose_gaps(self.recording, self.statistics):
+            poses[(times > begin) & (times < end)] = np.nan
+        return times, poses
+
+    def _instants(self, frames: Frames | None) -> str:
+        first, last = self.statistics.edges[[0, -1]]
+        during = np.flatnonzero((frames.times >= first) & (frames.times <= last)) if frames is not None else []
+        if frames is None or not len(during):
+            times = np.linspace(first, last, NUM_INSTANTS + 2)[1:-1].astype(np.int64)
+            return "".join(self._instant(int(time)) for time in times)
+        chosen = np.unique(np.linspace(0, len(during) - 1, NUM_INSTANTS + 2)[1:-1].round().astype(int))
+        return "".join(self._instant(int(frames.times[i]), frames.filenames[i], frames.camera) for i in during[chosen])
+
+    def _instant(self, time: int, frame: Path | None = None, camera: Camera | None = None) -> str:
+        pictures = []
+        caption = f"{time * 1e-9:.3f} s"
+        if frame is not None and camera is not None:
+            pictures.append(_image(camera.undistort(load_image(frame)), "JPEG", f"frame at {caption}"))
+        events = event_picture(self.recording.index, self.recording.camera, time)
+        pictures.append(_image(events, "PNG", f"events at {caption}"))
+        name = f", {html.escape(frame.name)}" if frame else ""
+        return f'<figure><div class="pair">{"".join(pictures)}</div><figcaption>{caption}{name}</figcaption></figure>'
+
+
+def problems_table(problems: list[Problem]) -> Table | str:
+    """Problems in red, each with what to do about it, for the terminal."""
+    if not problems:
+        return "[green]No problems were found.[/green]"
+    table = Table(title=f"[red]Problems ({len(problems)})[/red]", title_justify="left", show_lines=True)
+    table.add_column("what was found", style="red", ratio=1)
+    table.add_column("what to do", ratio=1)
+    for problem in problems:
+        table.add_row(escape(problem.what), escape(problem.advice))
+    return table
+
+
+def _round(number: float) -> str:
+    """To three digits."""
+    return f"{float(f'{number:.3g}'):,.0f}"
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first * 1e-9:.3f} s to {last * 1e-9:.3f} s"
+
+
+def _camera(camera: Camera) -> str:
+    seen = camera.undistorted()
+    across, down = (
+        math.degrees(2 * math.atan(pixels / (2 * focal_length)))
+        for pixels, focal_length in ((seen.width, seen.fx), (seen.height, seen.fy))
+    )
+    return f"{camera.width} x {camera.height}, {camera.model}, sees {across:.0f} x {down:.0f} degrees"
+
+
+def _extrinsics(recording: EventRecording, frames: Frames) -> str:
+    if frames.trajectory is recording.trajectory:
+        return "frames and events are seen from one place"
+    middle = torch.tensor(int(frames.times[len(frames.times) // 2]))
+    if not recording.trajectory.covers(middle):
+        return "unknown"
+    events, pictures = (trajectory.poses(middle).numpy() for trajectory in (recording.trajectory, frames.trajectory))
+    turn = Rotation.from_matrix(events[:, :3].T @ pictures[:, :3]).magnitude()
+    offset = events[:, :3].T @ (pictures[:, 3] - events[:, 3])
+    x, y, z = 1e3 * offset
+    return (
+        f"frame camera {x:.1f} mm right, {y:.1f} mm below, {z:.1f} mm before the event camera, "
+        f"turned by {math.degrees(turn):.2g} degrees"
+    )
+
+
+def _rectangle(low: np.ndarray, high: np.ndarray):
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(tuple(low), *(high - low), fill=False, linestyle="--", edgecolor=GREY)
+
+
+def _problem_box(problems: list[Problem]) -> str:
+    if not problems:
+        return '<section class="good">No problems were found.</section>'
+    items = "".join(f"<li><b>{html.escape(p.what)}</b><br>{html.escape(p.advice)}</li>" for p in problems)
+    title = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    return f'<section class="bad"><h2>{title}</h2><ul>{items}</ul></section>'
+
+
+def _html_table(rows: dict[str, str], notes: list[str] | None = None) -> str:
+    cells = [f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>" for name, value in rows.items()]
+    cells += [f'<tr class="note"><th class="note">note</th><td>{html.escape(note)}</td></tr>' for note in notes or []]
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _plot(figure: Figure, alt: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return f'<img class="plot" alt="{alt}" src="{_data_uri(buffer, "png")}">'
+
+
+def _image(pixels: UInt8[np.ndarray, "height width channels"], format: Literal["PNG", "JPEG"], alt: str) -> str:
+    image = Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
+    if image.width > PICTURE_WIDTH:
+        image = image.resize((PICTURE_WIDTH, round(image.height * PICTURE_WIDTH / image.width)), Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    image.save(buffer, format=format)
+    return f'<img alt="{alt}" src="{_data_uri(buffer, format.lower())}">'
+
+
+def _data_uri(buffer: io.BytesIO, format: str) -> str:
+    return f"data:image/{format};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise RecordingError(f"--output {path} could not be written ({error.strerror}); give another file.") from error
