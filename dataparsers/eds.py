@@ -194,7 +194,7 @@ def _read_image_list(
     folders = [folder / RAW_IMAGES, folder / PREPARED_IMAGES]
     folders = [path for path in (reversed(folders) if prepared else folders) if path.is_dir()]
     images = [tuple(sorted(path.glob("*.png")) or sorted(path.glob("*.jpg"))) for path in folders]
-    files = next(filter(None, images), ())
+    files: tuple[Path, ...] = next(filter(None, images), ())
     stamps = {folder / name: read_times(folder / name, "us") for name in STAMPS if (folder / name).exists()}
     if not files and not stamps:
         return (), np.zeros(0, np.int64)
@@ -203,7 +203,7 @@ def _read_image_list(
         return (), np.zeros(0, np.int64)
     if not stamps:
         raise RecordingError(
-            f"{files[0].parent} holds {len(files):,} images, but {' and '.join(STAMPS)} are missing, one of which "
+            f"{folder} holds {len(files):,} images, but {' and '.join(STAMPS)} are missing, one of which "
             "holds their stamps (t_us); add it."
         )
     path = _on_the_clock_of(events, stamps)

@@ -114,6 +114,8 @@ def _messages(path: Path, topic: str) -> Iterator[Any]:
                     "expected."
                 )
         for connection, _, data in bag.messages(connections):
+            if connection.topic != topic:
+                raise ValueError(f"its index takes a message on {connection.topic} for one on {topic}")
             yield data if topic == EVENTS else store.deserialize_ros1(data, connection.msgtype)
 
 
@@ -131,17 +133,16 @@ def _read_camera(path: Path) -> Camera:
     info = next(_messages(path, CAMERA), None)
     if info is None:
         raise RecordingError(f"{path} holds no message on {CAMERA}, but the camera's calibration was expected.")
-    camera = checked_camera(path, info.width, info.height, info.K.reshape(3, 3), info.distortion_model, info.D)
     events = next(_messages(path, EVENTS), None)
     if events is None:
         raise RecordingError(f"{path} holds no events; give a recording with some.")
     (width, height), _ = _parse_events(path, events)
-    if (width, height) != (camera.width, camera.height):
+    if (width, height) != (info.width, info.height):
         raise RecordingError(
-            f"{path} holds a calibration for {camera.width} x {camera.height} pixels, but events of a sensor of "
+            f"{path} holds a calibration for {info.width} x {info.height} pixels, but events of a sensor of "
             f"{width} x {height}; give the calibration of the recording's own resolution."
         )
-    return camera
+    return checked_camera(path, width, height, info.K.reshape(3, 3), info.distortion_model, info.D)
 
 
 def _parse_events(path: Path, data: bytes) -> tuple[tuple[int, int], np.ndarray]:
@@ -179,7 +180,8 @@ def _stream_events(path: Path) -> Iterator[Events]:
 
 def _joined(held: list[np.ndarray]) -> Events:
     events = np.concatenate(held)
-    return Events(events["x"], events["y"], events["s"] * np.int64(10**9) + events["ns"], events["polarity"])
+    times = events["s"].astype(np.int64) * 10**9 + events["ns"]
+    return Events(events["x"], events["y"], times, events["polarity"])
 
 
 def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
@@ -202,4 +204,5 @@ def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
     colour = TRUTH.get(flags[COLOUR].lower())
     if colour is None:
         raise RecordingError(f"{path} holds --{COLOUR}={flags[COLOUR]}, where true or false was expected.")
-    return checked_sensor(path, *numbers, "RGGB" if colour else "")
+    on, off, refractory_period = numbers
+    return checked_sensor(path, on, off, refractory_period, "RGGB" if colour else "")

@@ -27,11 +27,11 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Literal
 from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.calibration import Camera, check_rotation
@@ -48,7 +48,11 @@ coincide; as stamps are whole nanoseconds, the speed between two such poses woul
 LATEST = 2**62
 """Nanoseconds, 146 years; what lies beyond is no time."""
 
-DISTORTION_MODELS = {"plumb_bob": "radtan", "equidistant": "fisheye", "fisheye": "fisheye"}
+DISTORTION_MODELS: dict[str, Literal["radtan", "fisheye"]] = {
+    "plumb_bob": "radtan",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
 """Names of ROS, and ours."""
 
 KINDS = {"integers": "iu", "whole numbers or booleans": "iub", "numbers": "iuf", "text": "US"}
@@ -316,12 +320,6 @@ def read_views(folder: Path, notes: list[str]) -> Frames | None:
             raise RecordingError(
                 f"{image} has {found[0]} x {found[1]} pixels, but {images[0].name} has {width} x {height}; views must "
                 "be of one size."
-            )
-    with Image.open(images[0]) as first:
-        if "A" in first.getbands():
-            notes.append(
-                f"The {len(images)} views of {path} are transparent, and that is dropped; Robust e-NeRF puts them on "
-                "white, as the simulator did before it made the events."
             )
     rotations = Rotation.from_matrix(np.stack(poses)[:, :3, :3] * [1.0, -1.0, -1.0])
     times = np.arange(len(images), dtype=np.int64) * 10**9

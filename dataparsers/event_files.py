@@ -334,7 +334,7 @@ def _check_aedat4(path: Path) -> None:
 
 
 def _guarded(path: Path, call: Callable):
-    """What a reader in Rust returns; its panics are no `Exception`, and it prints them to the process's standard error."""
+    """What a reader in Rust returns; its panics are no `Exception`, and are printed to the process's standard error."""
     sys.stderr.flush()
     stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)

@@ -28,6 +28,9 @@ COLUMNS = ("x", "y", "t", "p")
 LATEST = 2**62 // 1000
 """µs; what lies beyond (146 years) does not fit into 64 bits of nanoseconds, or is no µs."""
 
+BLOSC_FILTERS, BLOSC_PARAMETERS = (32001, 32026), 4
+"""Blosc and Blosc2, which end the process where they find fewer parameters in a damaged file."""
+
 SMALLEST_CACHE = 2**20
 """Bytes for chunks that were decompressed and are not yet used up."""
 
@@ -195,12 +198,17 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
 
     properties = dataset.id.get_create_plist()
     for i in range(properties.get_nfilters()):
-        number, _, _, name = properties.get_filter(i)
+        number, _, parameters, name = properties.get_filter(i)
         if not h5py.h5z.filter_avail(number):
             called = f" ({name.decode(errors='replace')})" if name else ""
             raise RecordingError(
                 f"{path} is compressed by the HDF5 filter {number}{called}, which is neither in h5py nor in "
                 "hdf5plugin; install its plugin and set HDF5_PLUGIN_PATH, or repack the file without it."
+            )
+        if number in BLOSC_FILTERS and len(parameters) < BLOSC_PARAMETERS:
+            raise RecordingError(
+                f"{path} is compressed by the HDF5 filter {number} (Blosc) and lacks its parameters; copy it again "
+                "from its source."
             )
 
 

@@ -21,7 +21,7 @@ import torch
 
 from enerf_ns.dataparsers.events import EventIndex, EventStream, Survey, sorted_bands
 
-LAYOUT = 1
+LAYOUT = 2
 """Counted up when what is stored changes."""
 
 CACHED_FROM = 2_000_000
@@ -59,6 +59,8 @@ def load_index(name: str) -> tuple[EventIndex, Survey] | None:
                 raise ValueError(f"{column} is damaged")
         times, positives, counts = (np.memmap(folder / column, kind, "c") for column, kind in COLUMNS.items())
         survey = Survey(counts=np.array(counts), **stored["survey"])
+        if len(times) != len(positives) or len(times) != survey.counts.sum():
+            raise ValueError("the columns do not fit together")
         survey.hot_pixels = np.array(survey.hot_pixels, np.int64)
     except FileNotFoundError:
         return None

@@ -55,6 +55,9 @@ MOVING = 0.3
 DROPOUT_RATIO = 0.02
 """The sensor is silent below this share of the usual event rate; noise alone makes some per cent in dim light."""
 
+MIN_SILENT_MOTION = 5.0
+"""Pixels that the picture moves during a silence. Where the camera turns back, edges pass twice before pixels fire."""
+
 BURST_RATIO = 20
 """A burst exceeds the usual event rate by this, beyond what the speed of the camera explains."""
 
@@ -234,12 +237,14 @@ def unusual_rates(
     poses = recording.trajectory.poses(torch.from_numpy(edges)).numpy()
     distance = _viewing_distance(recording, statistics, depth_range)
     turns, moves = _steps(Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3])
-    speed = (turns + moves / distance) / np.maximum(np.diff(edges), 1)
+    shift = recording.camera.fx * (turns + moves / distance)
+    speed = shift / np.maximum(np.diff(edges), 1)
     moving = speed > MOVING * np.percentile(speed, 90)
     usual_rate, usual_speed = (np.median(column[moving]) if moving.any() else 0.0 for column in (rate, speed))
-    silent = moving & (rate < DROPOUT_RATIO * usual_rate)
+    silences = _spans(moving & (rate < DROPOUT_RATIO * usual_rate), edges)
+    shifted = np.diff(np.interp(silences, edges, np.append(0.0, np.cumsum(shift))), axis=1)[:, 0]
     burst = (rate > BURST_RATIO * usual_rate) & (rate * usual_speed > BURST_RATIO * usual_rate * speed)
-    return _spans(silent, edges), _spans(burst & (usual_rate > 0), edges)
+    return silences[shifted > MIN_SILENT_MOTION], _spans(burst & (usual_rate > 0), edges)
 
 
 def _left_out(recording: EventRecording) -> Iterator[Problem]:

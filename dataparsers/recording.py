@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -335,7 +336,7 @@ def _find_format(path: Path) -> str:
 
 
 def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
-    """An image file as uint8 with one or three channels; transparency is dropped, 16 bits become 8.
+    """An image file as uint8 with one or three channels; what is transparent is laid over white, 16 bits become 8.
 
     Raises:
         RecordingError: The file is missing or cannot be decoded.
@@ -345,6 +346,9 @@ def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
             if image.mode.startswith("I"):
                 return (np.asarray(image).clip(0, 65535) // 256).astype(np.uint8)[..., None]
             grey = image.mode in ("1", "L", "LA")
+            if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info:
+                colors = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colors)
             pixels = np.array(image.convert("L" if grey else "RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise _unreadable(path, "an image", error) from error
@@ -388,7 +392,7 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
     """
     try:
         array = np.load(path, mmap_mode=mmap_mode)  # type: ignore[arg-type]
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
+    except (OSError, ValueError, TypeError, EOFError, SyntaxError, TokenError) as error:
         raise _unreadable(path, "a NumPy array (.npy)", error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +63,7 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
     for cell, number in zip(cells, numbers, strict=True):
         try:
             time = int((Decimal(cell) * NANOSECONDS[unit]).to_integral_value())
-        except (InvalidOperation, ValueError, OverflowError) as error:
+        except (ArithmeticError, ValueError) as error:
             raise _not_a_number(path, number, cell) from error
         if abs(time) >= 2**62:
             raise RecordingError(f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years.")

@@ -92,7 +92,7 @@ class Trajectory:
                 f"s, but the trajectory covers only {self.start * 1e-9:.6f} s to {self.end * 1e-9:.6f} s."
             )
         knots, angles, rotations, spline = self._knots_on(times.device)
-        flat = times.flatten()
+        flat = times.flatten().contiguous()
         segment = torch.searchsorted(knots, flat, right=True).sub_(1).clamp_(max=len(angles) - 1)
         passed = (flat - knots[segment]).double()
         duration = (knots[1:] - knots[:-1])[segment]

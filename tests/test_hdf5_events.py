@@ -119,9 +119,9 @@ def test_events_appended_later_do_not_count(tmp_path: Path):
     events = Hdf5Events(path)
     stream = events.stream(0)
     with h5py.File(path, "a") as file:
-        for name in "xytp":
-            file[name].resize((2 * NUM_EVENTS,))
-            file[name][NUM_EVENTS:] = 1
+        for dataset in file.values():
+            dataset.resize((2 * NUM_EVENTS,))
+            dataset[NUM_EVENTS:] = 1
     assert sum(len(piece) for piece in stream) == NUM_EVENTS
     check(read(events))
     assert events.num_events == NUM_EVENTS
@@ -130,8 +130,8 @@ def test_events_appended_later_do_not_count(tmp_path: Path):
 def test_a_file_that_shrank_is_noticed(tmp_path: Path):
     events = Hdf5Events(write(tmp_path / "events.h5", maxshape=(None,)))
     with h5py.File(events.path, "a") as file:
-        for name in "xytp":
-            file[name].resize((NUM_EVENTS - 1,))
+        for dataset in file.values():
+            dataset.resize((NUM_EVENTS - 1,))
     with pytest.raises(RecordingError, match=r"held 5,000 events and holds fewer now"):
         read(events)
 
@@ -280,12 +280,20 @@ def test_a_filter_that_is_not_there(tmp_path: Path):
         Hdf5Events(path)
 
 
-@pytest.mark.parametrize("storage", [{}, {"chunks": (500,), **hdf5plugin.Blosc(cname="zstd")}])
+def test_a_filter_without_its_parameters(tmp_path: Path):
+    """In the file, their number stands before the name of the filter."""
+    path = write(tmp_path / "events.h5", **hdf5plugin.Blosc())
+    path.write_bytes(path.read_bytes().replace(b"\x07\0blosc", b"\0\0blosc"))
+    with pytest.raises(RecordingError, match=r"compressed by the HDF5 filter 32001 \(Blosc\) and lacks its parameters"):
+        Hdf5Events(path)
+
+
+@pytest.mark.parametrize("storage", [{}, {"chunks": (500,), "compression": "gzip"}])
 def test_flipped_bytes_give_a_sentence_or_events(tmp_path: Path, storage: dict):
     """The library underneath checks little, but what it raises must not come through."""
     whole = write(tmp_path / "whole.h5", data=columns(1000), **storage).read_bytes()
     rng, path, failures = np.random.default_rng(1), tmp_path / "events.h5", 0
-    for _ in range(300):
+    for _ in range(100):
         content = bytearray(whole)
         places = rng.integers(0, min(len(content), 6000), 4)
         for place in places:

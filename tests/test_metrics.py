@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-from enerf_ns.evaluation.metrics import align_brightness, correlation, depth_rmse, image_metrics
+from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
 from enerf_ns.event_camera import inverse_linlog, linlog
 
 
@@ -32,6 +32,36 @@ def test_alignment_is_the_least_squares_of_numpy_over_all_pictures_together():
     x, y = (torch.cat([linlog(image).flatten() for image in images]).numpy() for images in (rendered, recorded))
     expected = np.linalg.lstsq(np.column_stack([x, np.ones_like(x)]), y, rcond=None)[0]
     np.testing.assert_allclose(align_brightness(rendered, recorded)[1], expected, rtol=1e-9)
+
+
+def test_channels_align_by_the_least_squares_of_numpy_each_by_itself():
+    rendered = pictures(3)
+    scale, offset = torch.tensor([0.6, 1.1, 0.9]), torch.tensor([0.9, -0.4, 0.1])
+    noise = pictures(3, seed=1)
+    recorded = [
+        inverse_linlog(scale * linlog(a) + offset + 0.05 * b).clamp(0, 1) for a, b in zip(rendered, noise, strict=True)
+    ]
+    aligned, fits = align_channels(rendered, recorded)
+    assert len(fits) == 3 and [image.shape for image in aligned] == [image.shape for image in rendered]
+    for channel, fit in enumerate(fits):
+        x, y = (
+            torch.cat([linlog(image[..., channel]).flatten() for image in images]).numpy()
+            for images in (rendered, recorded)
+        )
+        expected = np.linalg.lstsq(np.column_stack([x, np.ones_like(x)]), y, rcond=None)[0]
+        np.testing.assert_allclose(fit, expected, rtol=1e-9)
+        for image, original in zip(aligned, rendered, strict=True):
+            truth = inverse_linlog(expected[0] * linlog(original[..., channel]) + expected[1]).clamp(0, 1)
+            torch.testing.assert_close(image[..., channel], truth, rtol=0, atol=1e-9)
+
+
+def test_channels_of_equal_pictures_align_as_grey_ones_do():
+    grey, recorded = ([image[..., :1] for image in pictures(2, seed)] for seed in (0, 1))
+    aligned, fit = align_brightness(grey, recorded)
+    in_colour, fits = align_channels(*([image.repeat(1, 1, 3) for image in images] for images in (grey, recorded)))
+    assert fits == [fit] * 3
+    for image, expected in zip(in_colour, aligned, strict=True):
+        torch.testing.assert_close(image, expected.expand(-1, -1, 3), rtol=0, atol=0)
 
 
 def test_alignment_keeps_the_type_of_the_pictures_and_their_range():

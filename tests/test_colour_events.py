@@ -1,0 +1,244 @@
+"""A sensor with a colour filter, from events to colour: a camera slides past a wall painted with waves."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Type  # noqa: UP035 - as the config it derives from
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.scripts.train import _set_random_seed
+from PIL import Image
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.enerf_config import enerf
+from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.event_camera import inverse_linlog
+from enerf_ns.scene_choices import fill_in_choices
+from enerf_ns.simulator.esim import EventGenerator
+
+WIDTH, HEIGHT, FOCAL = 32, 24, 32.0
+PATTERN = "GRBG"
+THRESHOLDS = (0.2, 0.2)
+SECOND = 1_000_000_000
+
+
+WAVES = np.random.default_rng(3).uniform(-1, 1, (4, 3, 3)) * [14.0, 14.0, 3.0]
+"""Of every channel four waves: radians per metre along x and y, and the phase."""
+
+
+def position(time: int | np.ndarray) -> np.ndarray:
+    """Of the camera, metres, (..., 3): a circle before the wall, which is the plane z = 1."""
+    angle = 2 * np.pi * np.asarray(time) / SECOND
+    return np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.0 * angle], axis=-1)
+
+
+def log_brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Of all three channels at points of the wall (metres), (..., 3)."""
+    waves = np.sin(WAVES[..., 0] * x[..., None, None] + WAVES[..., 1] * y[..., None, None] + WAVES[..., 2])
+    return 4.0 + 0.35 * waves.sum(axis=-2)
+
+
+def picture(time: int) -> np.ndarray:
+    """Log brightness that the camera sees, (HEIGHT, WIDTH, 3)."""
+    row, column = np.indices((HEIGHT, WIDTH))
+    x, y, _ = position(time)
+    return log_brightness((column - (WIDTH - 1) / 2) / FOCAL + x, (row - (HEIGHT - 1) / 2) / FOCAL + y)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
+    """One second of colour events, and five frames in colour."""
+    folder = tmp_path_factory.mktemp("colour")
+    row, column = np.indices((HEIGHT, WIDTH))
+    seen = np.array(["RGB".index(letter) for letter in PATTERN]).reshape(2, 2)[row % 2, column % 2]
+
+    def mosaic(time: int) -> np.ndarray:
+        return np.take_along_axis(picture(time), seen[..., None], axis=-1)[..., 0]
+
+    generator = EventGenerator(mosaic(0), 0, THRESHOLDS)
+    times = np.arange(1, 401) * (SECOND // 400)
+    rows = np.concatenate([generator.advance(mosaic(time), time) for time in times.tolist()])
+    np.save(folder / "events.npy", rows)
+
+    camera = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    pose_times = np.arange(0, 101) * (SECOND // 100)
+    trajectory = Trajectory(pose_times, position(pose_times), np.tile([0.0, 0.0, 0.0, 1.0], (101, 1)))
+    frame_times = np.array([1, 3, 5, 7, 9]) * (SECOND // 10)
+    files = tuple(folder / f"{i}.png" for i in range(len(frame_times)))
+    for file, time in zip(files, frame_times.tolist(), strict=True):
+        brightness = inverse_linlog(torch.from_numpy(picture(time))).numpy()
+        Image.fromarray((255.0 * brightness).round().astype(np.uint8)).save(file)
+
+    def stream() -> Iterator[Events]:
+        yield Events(*rows.T)
+
+    return EventRecording(
+        path=folder,
+        format="colour",
+        camera=camera,
+        trajectory=trajectory,
+        stream_events=stream,
+        event_files=(folder / "events.npy",),
+        frames=Frames(files, frame_times, camera, trajectory),
+        contrast_thresholds=THRESHOLDS,
+        bayer_pattern=PATTERN,
+        depth_range=(0.8, 1.2),
+    )
+
+
+@dataclass
+class MemoryDataParserConfig(EventDataParserConfig):
+    _target: Type = field(default_factory=lambda: MemoryDataParser)  # noqa: UP006
+    recording: Any = None
+
+
+class MemoryDataParser(EventDataParser):
+    def recording(self) -> EventRecording:
+        return self.config.recording  # type: ignore
+
+
+def small_config(recording: EventRecording, supervision: Any = "events") -> EnerfPipelineConfig:
+    config = copy.deepcopy(enerf.config.pipeline)
+    assert isinstance(config, EnerfPipelineConfig)
+    manager, model = config.datamanager, config.model
+    manager.dataparser = MemoryDataParserConfig(data=recording.path, recording=recording)
+    manager.supervision = supervision
+    manager.event_pairs, manager.silent_pairs, manager.silence_ms = 256, 64, 5.0
+    model.log2_table_size, model.num_levels = 12, 4
+    model.num_samples = model.num_proposal_samples = 16
+    return config
+
+
+def make_pipeline(recording: EventRecording, **changes: Any) -> Any:
+    _set_random_seed(0)
+    config = small_config(recording, **changes)
+    fill_in_choices(config, recording)
+    pipeline = config.setup(device="cpu")
+    pipeline.train()
+    return pipeline
+
+
+def test_a_step_says_which_channel_every_pair_sees(recording: EventRecording):
+    """From the directions of its rays, projected into the sensor."""
+    manager = make_pipeline(recording).datamanager
+    rays, batch = manager.next_train(0)
+    turn = manager.train_dataparser_outputs.dataparser_transform[:, :3]
+    assert batch["num_pairs"] == len(batch["channel"]) == 256 + 64
+    x, y, z = (rays.directions @ turn).T
+    column = (FOCAL * x / z + (WIDTH - 1) / 2).round().int().tolist()
+    row = (FOCAL * y / z + (HEIGHT - 1) / 2).round().int().tolist()
+    letters = [PATTERN[2 * (v % 2) + u % 2] for u, v in zip(column, row, strict=True)]
+    channels = [int(channel) for channel in batch["channel"].repeat(2)]
+    assert [letters.count(letter) for letter in "RGB"] == [channels.count(channel) for channel in range(3)]
+    assert letters == ["RGB"[channel] for channel in channels]
+
+
+@pytest.mark.parametrize("loss", ["huber", "squared", "normalised"])
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, channel: int, loss: str):
+    pipeline = make_pipeline(recording)
+    pipeline.model.config.event_loss = loss
+    rays, batch = pipeline.datamanager.next_train(0)
+    events = len(batch["on"])
+    batch["channel"] = torch.full_like(batch["channel"], channel)
+    batch["channel"][events:] = (channel + 1) % 3
+    outputs = pipeline.model(rays)
+    losses = pipeline.model.get_loss_dict(outputs, batch)
+    weight = pipeline.model.field.color_network.layers[-1].weight
+    for name, taught in {"event_loss": channel, "no_event_loss": (channel + 1) % 3}.items():
+        (gradient,) = torch.autograd.grad(losses[name], weight, retain_graph=True)
+        assert [bool(row.any()) for row in gradient] == [c == taught for c in range(3)]
+
+
+def test_the_change_of_a_pair_is_that_of_its_channel(recording: EventRecording):
+    """Rendered from the true brightness, the changes of all pairs lie within a threshold of what the events say."""
+    pipeline = make_pipeline(recording)
+    manager, model = pipeline.datamanager, pipeline.model
+    rays, batch = manager.next_train(0)
+    outputs = manager.train_dataparser_outputs
+    turn, scale = outputs.dataparser_transform, outputs.dataparser_scale
+    position = (rays.origins / scale - turn[:, 3]) @ turn[:, :3]
+    direction = rays.directions @ turn[:, :3]
+    x = (position + direction / direction[:, 2:])[:, 0].double()
+    waves = torch.stack([torch.sin(9 * x), -torch.sin(9 * x), torch.cos(9 * x)], dim=-1)
+    rgb = inverse_linlog(4.0 + 0.6 * waves)
+    predicted, measured, num_events = model.brightness_changes({"rgb": rgb}, batch)
+    np.testing.assert_allclose(predicted[:num_events], measured, atol=0.005)
+    assert predicted[num_events:].abs().max() < 0.2
+
+
+def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(recording: EventRecording):
+    pipeline = make_pipeline(recording)
+    optimizer = torch.optim.Adam(pipeline.get_param_groups()["fields"], lr=1e-2, eps=1e-15)
+    for step in range(120):
+        _, losses, _ = pipeline.get_train_loss_dict(step)
+        optimizer.zero_grad()
+        sum(losses.values()).backward()
+        optimizer.step()
+    assert pipeline.event_correlation(2048) > 0.9
+
+    views, summary = pipeline.held_out_views()
+    for channel, name in enumerate(("red", "green", "blue")):
+        rendered, recorded = (
+            np.log(np.concatenate([255.0 * picture.double()[..., channel].numpy().ravel() for picture in pictures]))
+            for pictures in ([view.unaligned for view in views], [view.recorded for view in views])
+        )
+        scale, offset = np.polyfit(rendered, recorded, 1)
+        assert summary[f"brightness_scale_{name}"] == pytest.approx(scale, rel=1e-4)
+        assert summary[f"brightness_offset_{name}"] == pytest.approx(offset, rel=1e-4)
+        assert np.corrcoef(rendered, recorded)[0, 1] > 0.9
+    assert not {"brightness_scale", "brightness_offset"} & set(summary)
+
+    scores, _ = pipeline.get_eval_image_metrics_and_images(0)
+    assert scores["psnr"] > 15
+
+
+def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
+    grey = replace(recording, bayer_pattern=None, frames=recording.frames)
+    pipeline = make_pipeline(grey)
+    assert pipeline.model.config.num_channels == 1
+    assert "channel" not in pipeline.datamanager.next_train(0)[1]
+    _, summary = pipeline.held_out_views()
+    assert {"brightness_scale", "brightness_offset"} <= set(summary)
+
+
+@pytest.mark.parametrize("supervision", ["events", "events+frames"])
+def test_a_colour_filter_needs_three_channels_and_the_table_says_so(recording: EventRecording, supervision: str):
+    config = small_config(recording, supervision)
+    colour = next(choice for choice in fill_in_choices(config, recording) if choice.part == "colour")
+    assert config.model.num_channels == 3
+    assert colour.kept and colour.why == "the sensor has a colour filter (GRBG)"
+
+
+def test_one_channel_behind_a_colour_filter_is_refused(recording: EventRecording):
+    config = small_config(recording)
+    config.model.num_channels = 1
+    with pytest.raises(RecordingError, match=r"colour filter \(GRBG\).*--pipeline\.model\.num-channels is 1") as error:
+        fill_in_choices(config, recording)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("mode", "approximate"), [("successor", False), ("partner", True), ("window", True)])
+def test_the_refractory_period_reaches_the_sampler_and_the_table(recording: EventRecording, mode, approximate: bool):
+    blind = replace(recording, refractory_period=8_000_000)
+    config = small_config(blind)
+    config.datamanager.pair_mode = mode
+    choices = fill_in_choices(config, blind)
+    why = next(choice.why for choice in choices if choice.part == "event loss")
+    assert "8 ms" in why and ("successor" in why) == approximate
+    manager = config.setup(device="cpu").datamanager
+    pairs = manager.pair_sampler.sample(1000, torch.Generator().manual_seed(0))
+    event_times = set(recording.index.times.tolist())
+    shifted = [start - 8_000_000 in event_times for start, end in zip(pairs.start.tolist(), pairs.end.tolist())]
+    assert np.mean(shifted) > 0.9
+    silent = manager.silent_sampler.sample(1000, torch.Generator().manual_seed(0))
+    before = recording.index.count_until(silent.pixels, silent.start)
+    latest = recording.index.times[recording.index.offsets[silent.pixels] + before - 1]
+    assert (silent.start - latest >= 8_000_000)[before > 0].all()
