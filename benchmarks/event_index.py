@@ -36,7 +36,9 @@ def write_events(path: Path, num_events: int) -> None:
     types = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
     with h5py.File(path, "w") as file:
         columns = {
-            name: file.create_dataset(f"events/{name}", num_events, dtype, chunks=(100_000,), **hdf5plugin.Blosc("zstd"))
+            name: file.create_dataset(
+                f"events/{name}", num_events, dtype, chunks=(100_000,), **hdf5plugin.Blosc("zstd")
+            )
             for name, dtype in types.items()
         }
         for first in range(0, num_events, piece):

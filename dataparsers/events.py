@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,12 +91,16 @@ class EventIndex:
         """Number of positive events; the others are negative."""
         return int(self.positives[-1]) if len(self) else 0
 
+    @cached_property
+    def _most_events(self) -> int:
+        """Of one pixel."""
+        return int(self.offsets.diff().max())
+
     def count_until(self, pixels: Int64[Tensor, "*batch"], times: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
         """How many events each pixel fired at or before a time (ns), by binary search within the pixel."""
         first, stop = self.offsets[pixels], self.offsets[pixels + 1]
         following = first
-        steps = int(self.offsets.diff().max()).bit_length() if len(self) else 0
-        for step in reversed(range(steps)):
+        for step in reversed(range(self._most_events.bit_length())):
             candidate = following + (1 << step)
             passed = (candidate <= stop) & (self.times[(candidate - 1).clamp(max=len(self.times) - 1)] <= times)
             following = torch.where(passed, candidate, following)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
@@ -42,8 +42,9 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """What the field learns from."""
     event_pairs: int = 1024
     """Pairs of instants with events between them, drawn at each step."""
-    pair_mode: Literal["successor", "partner", "window"] = "partner"
-    """The other event of a pair: the pixel's next; one of its next few; its last in a window of time."""
+    pair_mode: Optional[Literal["successor", "partner", "window"]] = None  # noqa: UP045
+    """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. None: one of the
+    next few, but the next where the sensor has a refractory period, in which changes go unseen."""
     max_pair_distance: int = 10
     """Events of the pixel that a partner may lie ahead, for pair-mode partner."""
     window_ms: float = 60.0
@@ -82,6 +83,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def setup_events(self, recording: EventRecording) -> None:
         """Index the events on the device, and what turns pixels and times into rays."""
         config, camera = self.config, recording.camera
+        assert config.pair_mode is not None, "enerf_ns.scene_choices fills it in"
         index = recording.index.to(self.device)
         self.silent_sampler = None
         try:

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from enerf_ns.enerf_field import EnerfField, HashDensity
-from enerf_ns.evaluation.metrics import align_brightness, image_metrics
-from enerf_ns.event_camera import linlog, luma, measured_change
+from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
+from enerf_ns.event_camera import linlog, luma, measured_change, pixel_brightness
 from enerf_ns.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 from enerf_ns.ray_samplers import SharedJitter
 
@@ -53,7 +53,7 @@ class EnerfModelConfig(ModelConfig):
     brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
     """What the colour network's output spans evenly: log brightness, or brightness as in the paper."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
-    """Colour channels. None: 3 where the field learns from colour frames, else 1."""
+    """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
     sampling: Literal["proposal", "uniform"] = "proposal"
     """Samples along a ray: where a small network expects surfaces, or everywhere."""
     num_proposal_samples: int = 48
@@ -238,18 +238,22 @@ class EnerfModel(Model):
         return losses
 
     def brightness_changes(self, outputs, batch) -> tuple[Tensor, Tensor, int]:
-        """Rendered changes of log brightness (pairs,), measured ones (event pairs,), and how many pairs have events."""
+        """Rendered changes of log brightness (pairs,), measured ones (event pairs,), and how many pairs have events.
+
+        Behind a colour filter, log brightness is that of the channel that the pixel sees.
+        """
         num_pairs = batch["num_pairs"]
-        log_brightness = linlog(luma(outputs["rgb"][: 2 * num_pairs]))
+        channel = batch["channel"].repeat(2) if "channel" in batch else None
+        log_brightness = linlog(pixel_brightness(outputs["rgb"][: 2 * num_pairs], channel))
         assert self.config.contrast_thresholds is not None
         measured = measured_change(batch["on"], batch["off"], self.config.contrast_thresholds)
         return log_brightness[num_pairs:] - log_brightness[:num_pairs], measured, len(measured)
 
     def frame_error(self, outputs, batch) -> Tensor:
-        """Mean squared error of the frame rays; in grey where the field is grey."""
+        """Mean squared error of the frame rays; in grey where the field is grey, or what was recorded."""
         rendered, recorded = outputs["rgb"][2 * batch["num_pairs"] :], batch["image"]
-        if self.config.num_channels == 1:
-            rendered, recorded = rendered[..., :1], luma(recorded)[..., None]
+        if self.config.num_channels == 1 or (recorded == recorded[..., :1]).all():
+            rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
         return frame_loss(rendered, recorded)
 
     @torch.no_grad()
@@ -272,7 +276,9 @@ class EnerfModel(Model):
         recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
         scores: dict[str, float] = {}
         if batch["is_frame"]:
-            rendered = align_brightness([rendered], [recorded])[0][0]
+            bayer_pattern = self.kwargs["metadata"]["recording"].bayer_pattern
+            align = align_channels if bayer_pattern else align_brightness
+            rendered = align([rendered], [recorded])[0][0]
             scores = image_metrics(rendered, recorded)
         images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
         return scores, images

@@ -18,8 +18,8 @@ from torch import Tensor
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
-from enerf_ns.evaluation.metrics import align_brightness, correlation, depth_rmse, image_metrics
-from enerf_ns.event_camera import linlog, luma, measured_change
+from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
+from enerf_ns.event_camera import linlog, measured_change, pixel_brightness
 
 
 @dataclass
@@ -64,13 +64,14 @@ class EnerfPipeline(VanillaPipeline):
         """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
 
         Returns:
-            The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit; for a
-            recording without frames, the correlation of its events.
+            The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
+            each channel where the sensor has a colour filter; for a recording without frames, the correlation of its
+            events.
         """
         self.eval()
         manager = self.datamanager
         dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
-        has_frames = dataset.recording.has_frames
+        has_frames = dataset.are_frames
         views: list[HeldOutView] = []
         start = time.perf_counter()
         for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
@@ -98,10 +99,17 @@ class EnerfPipeline(VanillaPipeline):
             summary["event_correlation"] = self.event_correlation()
         elif manager.config.supervision == "events":
             recorded = [view.recorded for view in views if view.recorded is not None]
-            aligned, (scale, offset) = align_brightness([view.rendered for view in views], recorded)
+            rendered = [view.rendered for view in views]
+            if dataset.recording.bayer_pattern is None:
+                aligned, fit = align_brightness(rendered, recorded)
+                fits = {"": fit}
+            else:
+                aligned, channel_fits = align_channels(rendered, recorded)
+                fits = dict(zip(("_red", "_green", "_blue"), channel_fits, strict=True))
             for view, image in zip(views, aligned, strict=True):
                 view.rendered = image
-            summary |= {"brightness_scale": scale, "brightness_offset": offset}
+            for name, (scale, offset) in fits.items():
+                summary |= {f"brightness_scale{name}": scale, f"brightness_offset{name}": offset}
         self.train()
         return views, summary
 
@@ -119,7 +127,8 @@ class EnerfPipeline(VanillaPipeline):
         pairs = manager.pair_sampler.sample(num_pairs, generator)
         rays = manager.event_rays(pairs.pixels.repeat(2), torch.cat([pairs.start, pairs.end])).reshape((2, num_pairs))
         rendered = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
-        start, end = linlog(luma(rendered))
+        channel = None if manager.pixel_channels is None else manager.pixel_channels[pairs.pixels].expand(2, -1)
+        start, end = linlog(pixel_brightness(rendered, channel))
         self.train()
         return correlation(end - start, measured_change(pairs.on, pairs.off, thresholds))
 

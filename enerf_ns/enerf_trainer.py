@@ -29,8 +29,11 @@ class EnerfTrainerConfig(TrainerConfig):
     preset: Optional[PresetName] = None  # noqa: UP045
     """The selections of the E-NeRF paper for one of its sequences; flags that are set stand."""
 
-    def prepare(self) -> tuple[EventRecording, list[Choice]]:
-        """Read the recording and fill in what is open: paths, decay of the learning rate, choices.
+    def prepare(self) -> tuple[EventRecording, list[str], list[Choice]]:
+        """Read the recording and fill in what is open: paths, decay of the learning rate, preset, choices.
+
+        Returns:
+            The recording, what to say about the preset, and the choices.
 
         Raises:
             RecordingError: if the recording cannot be used. Nothing has been written then.
@@ -47,24 +50,25 @@ class EnerfTrainerConfig(TrainerConfig):
         for group in self.optimizers.values():
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         recording = EventDataParser(manager.dataparser).recording()
-        selected = []
+        selection: list[str] = []
         if self.preset is not None:
             from enerf_ns.enerf_config import METHODS  # here, since it imports this module
 
-            lines = apply_preset(self, METHODS[self.method_name], recording)
-            selected = [Choice("preset", True, line, "") for line in lines]
+            selection = apply_preset(self, METHODS[self.method_name], recording)
             recording = EventDataParser(manager.dataparser).recording()
-        choices = selected + fill_in_choices(self.pipeline, recording)
+        choices = fill_in_choices(self.pipeline, recording)
         recording.index  # noqa: B018 - reads and checks the events
-        return recording, choices
+        return recording, selection, choices
 
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""
         try:
-            recording, choices = self.prepare()
+            recording, selection, choices = self.prepare()
         except RecordingError as error:
             raise SystemExit(f"enerf: {error}") from error
         CONSOLE.print(recording_table(recording, self))
+        for line in selection:
+            CONSOLE.print(f"* {line}", highlight=False)
         CONSOLE.print(choices_table(choices))
         super().save_config()
         (self.get_base_dir() / "choices.json").write_text(json.dumps([asdict(choice) for choice in choices], indent=2))

@@ -17,10 +17,12 @@ class EventDataset(InputDataset):
         super().__init__(dataparser_outputs, scale_factor)
         self.recording: EventRecording = self.metadata["recording"]
         self.frames: Frames = self.metadata["frames"]
+        self.are_frames: bool = self.metadata["are_frames"]
+        """Whether the pictures are frames; otherwise they show events."""
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """Picture of shape (height, width, 3), uint8."""
-        if not self.recording.has_frames:
+        if not self.are_frames:
             return event_picture(self.recording.index, self.recording.camera, int(self.frames.times[image_idx]))
         image = self.frames.camera.undistort(load_image(self.frames.filenames[image_idx]))
         return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
@@ -28,7 +30,7 @@ class EventDataset(InputDataset):
     def get_metadata(self, data: dict) -> dict:
         """is_frame: whether the picture is a frame. depth, where the recording has it: metres along the optical axis
         (height, width, 1), 0 where unknown."""
-        metadata: dict = {"is_frame": self.recording.has_frames}
+        metadata: dict = {"is_frame": self.are_frames}
         if self.frames.depth_filenames is not None:
             depth = load_array(self.frames.depth_filenames[data["image_idx"]])
             metadata["depth"] = torch.from_numpy(depth)[..., None].float()

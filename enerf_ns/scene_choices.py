@@ -63,6 +63,8 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
     if model.contrast_thresholds is not None and min(model.contrast_thresholds) <= 0.0:
         raise RecordingError(f"--contrast-thresholds are {model.contrast_thresholds}, but both must be above 0")
 
+    if data.pair_mode is None:
+        data.pair_mode = "successor" if recording.refractory_period else "partner"
     if use_events:
         values = {
             "successor": "each event with the pixel's next",

@@ -1,4 +1,4 @@
-"""A sensor with a colour filter, from events to colour: a camera slides past a wall painted with waves."""
+"""A sensor with a colour filter, from events to colour: a camera circles before a wall painted with waves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, Recor
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
-from enerf_ns.event_camera import inverse_linlog
+from enerf_ns.evaluation.metrics import align_channels
+from enerf_ns.event_camera import inverse_linlog, linlog
 from enerf_ns.scene_choices import fill_in_choices
 from enerf_ns.simulator.esim import EventGenerator
 
@@ -28,8 +29,7 @@ PATTERN = "GRBG"
 THRESHOLDS = (0.2, 0.2)
 SECOND = 1_000_000_000
 
-
-WAVES = np.random.default_rng(3).uniform(-1, 1, (4, 3, 3)) * [14.0, 14.0, 3.0]
+WAVES = np.random.default_rng(4).uniform(-1, 1, (4, 3, 3)) * [14.0, 14.0, 3.0]
 """Of every channel four waves: radians per metre along x and y, and the phase."""
 
 
@@ -63,7 +63,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
         return np.take_along_axis(picture(time), seen[..., None], axis=-1)[..., 0]
 
     generator = EventGenerator(mosaic(0), 0, THRESHOLDS)
-    times = np.arange(1, 401) * (SECOND // 400)
+    times = np.arange(1, 1001) * (SECOND // 1000)
     rows = np.concatenate([generator.advance(mosaic(time), time) for time in times.tolist()])
     np.save(folder / "events.npy", rows)
 
@@ -89,7 +89,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
         frames=Frames(files, frame_times, camera, trajectory),
         contrast_thresholds=THRESHOLDS,
         bayer_pattern=PATTERN,
-        depth_range=(0.8, 1.2),
+        depth_range=(0.95, 1.05),
     )
 
 
@@ -110,15 +110,15 @@ def small_config(recording: EventRecording, supervision: Any = "events") -> Ener
     manager, model = config.datamanager, config.model
     manager.dataparser = MemoryDataParserConfig(data=recording.path, recording=recording)
     manager.supervision = supervision
-    manager.event_pairs, manager.silent_pairs, manager.silence_ms = 256, 64, 5.0
+    manager.event_pairs, manager.silent_pairs, manager.silence_ms = 256, 32, 5.0
     model.log2_table_size, model.num_levels = 12, 4
-    model.num_samples = model.num_proposal_samples = 16
+    model.sampling, model.num_samples = "uniform", 8
     return config
 
 
-def make_pipeline(recording: EventRecording, **changes: Any) -> Any:
+def make_pipeline(recording: EventRecording) -> Any:
     _set_random_seed(0)
-    config = small_config(recording, **changes)
+    config = small_config(recording)
     fill_in_choices(config, recording)
     pipeline = config.setup(device="cpu")
     pipeline.train()
@@ -130,13 +130,13 @@ def test_a_step_says_which_channel_every_pair_sees(recording: EventRecording):
     manager = make_pipeline(recording).datamanager
     rays, batch = manager.next_train(0)
     turn = manager.train_dataparser_outputs.dataparser_transform[:, :3]
-    assert batch["num_pairs"] == len(batch["channel"]) == 256 + 64
+    assert batch["num_pairs"] == len(batch["channel"]) == 256 + 32
     x, y, z = (rays.directions @ turn).T
     column = (FOCAL * x / z + (WIDTH - 1) / 2).round().int().tolist()
     row = (FOCAL * y / z + (HEIGHT - 1) / 2).round().int().tolist()
     letters = [PATTERN[2 * (v % 2) + u % 2] for u, v in zip(column, row, strict=True)]
     channels = [int(channel) for channel in batch["channel"].repeat(2)]
-    assert [letters.count(letter) for letter in "RGB"] == [channels.count(channel) for channel in range(3)]
+    assert set(channels) == {0, 1, 2}
     assert letters == ["RGB"[channel] for channel in channels]
 
 
@@ -145,6 +145,7 @@ def test_a_step_says_which_channel_every_pair_sees(recording: EventRecording):
 def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, channel: int, loss: str):
     pipeline = make_pipeline(recording)
     pipeline.model.config.event_loss = loss
+    torch.nn.init.normal_(pipeline.model.field.geometry.grid.table)
     rays, batch = pipeline.datamanager.next_train(0)
     events = len(batch["on"])
     batch["channel"] = torch.full_like(batch["channel"], channel)
@@ -158,50 +159,60 @@ def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, chann
 
 
 def test_the_change_of_a_pair_is_that_of_its_channel(recording: EventRecording):
-    """Rendered from the true brightness, the changes of all pairs lie within a threshold of what the events say."""
+    """With the wall's true brightness as a render, the pairs change as their events say."""
     pipeline = make_pipeline(recording)
     manager, model = pipeline.datamanager, pipeline.model
     rays, batch = manager.next_train(0)
     outputs = manager.train_dataparser_outputs
     turn, scale = outputs.dataparser_transform, outputs.dataparser_scale
-    position = (rays.origins / scale - turn[:, 3]) @ turn[:, :3]
-    direction = rays.directions @ turn[:, :3]
-    x = (position + direction / direction[:, 2:])[:, 0].double()
-    waves = torch.stack([torch.sin(9 * x), -torch.sin(9 * x), torch.cos(9 * x)], dim=-1)
-    rgb = inverse_linlog(4.0 + 0.6 * waves)
+    origins = (rays.origins / scale - turn[:, 3]) @ turn[:, :3]
+    directions = rays.directions @ turn[:, :3]
+    x, y, _ = (origins + directions / directions[:, 2:]).double().numpy().T
+    rgb = inverse_linlog(torch.from_numpy(log_brightness(x, y)))
     predicted, measured, num_events = model.brightness_changes({"rgb": rgb}, batch)
-    np.testing.assert_allclose(predicted[:num_events], measured, atol=0.005)
-    assert predicted[num_events:].abs().max() < 0.2
+    np.testing.assert_allclose(predicted[:num_events], measured, atol=1e-3)
+    assert predicted[num_events:].abs().max() < 2 * max(THRESHOLDS)
 
 
 def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(recording: EventRecording):
+    """The wall is opaque from the beginning, so that it is colour that is learnt."""
     pipeline = make_pipeline(recording)
-    optimizer = torch.optim.Adam(pipeline.get_param_groups()["fields"], lr=1e-2, eps=1e-15)
-    for step in range(120):
+    pipeline.model.field.geometry.init_density = 50.0
+    optimizer = torch.optim.Adam(pipeline.get_param_groups()["fields"], lr=2e-2, eps=1e-15)
+    for step in range(200):
         _, losses, _ = pipeline.get_train_loss_dict(step)
         optimizer.zero_grad()
-        sum(losses.values()).backward()
+        torch.stack(list(losses.values())).sum().backward()
         optimizer.step()
-    assert pipeline.event_correlation(2048) > 0.9
+    assert pipeline.event_correlation(2048) > 0.85
 
     views, summary = pipeline.held_out_views()
+    rendered, recorded, aligned = (
+        torch.stack([getattr(view, name) for view in views]).double().reshape(-1, 3)
+        for name in ("unaligned", "recorded", "rendered")
+    )
+    correlations = np.corrcoef(linlog(rendered).T, linlog(recorded).T)[:3, 3:]
+    assert (correlations.diagonal() > 0.75).all()
+    assert (correlations.argmax(axis=1) == [0, 1, 2]).all()
     for channel, name in enumerate(("red", "green", "blue")):
-        rendered, recorded = (
-            np.log(np.concatenate([255.0 * picture.double()[..., channel].numpy().ravel() for picture in pictures]))
-            for pictures in ([view.unaligned for view in views], [view.recorded for view in views])
-        )
-        scale, offset = np.polyfit(rendered, recorded, 1)
-        assert summary[f"brightness_scale_{name}"] == pytest.approx(scale, rel=1e-4)
-        assert summary[f"brightness_offset_{name}"] == pytest.approx(offset, rel=1e-4)
-        assert np.corrcoef(rendered, recorded)[0, 1] > 0.9
+        x, y = linlog(rendered[:, channel]), linlog(recorded[:, channel])
+        scale, offset = np.polyfit(x, y, 1)
+        assert summary[f"brightness_scale_{name}"] == pytest.approx(scale, rel=1e-6)
+        assert summary[f"brightness_offset_{name}"] == pytest.approx(offset, rel=1e-6)
+        expected = inverse_linlog(scale * x + offset).clamp(0, 1)
+        torch.testing.assert_close(aligned[:, channel], expected, rtol=0, atol=1e-6)
     assert not {"brightness_scale", "brightness_offset"} & set(summary)
 
-    scores, _ = pipeline.get_eval_image_metrics_and_images(0)
-    assert scores["psnr"] > 15
+    recorded, rendered = views[0].recorded, views[0].unaligned
+    _, images = pipeline.model.get_image_metrics_and_images(
+        {"rgb": rendered, "depth": views[0].depth}, {"image": recorded, "is_frame": True}
+    )
+    shown = align_channels([rendered], [recorded])[0][0]
+    torch.testing.assert_close(images["img"], torch.cat([recorded, shown], dim=1))
 
 
 def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
-    grey = replace(recording, bayer_pattern=None, frames=recording.frames)
+    grey = replace(recording, bayer_pattern=None)
     pipeline = make_pipeline(grey)
     assert pipeline.model.config.num_channels == 1
     assert "channel" not in pipeline.datamanager.next_train(0)[1]
@@ -235,9 +246,8 @@ def test_the_refractory_period_reaches_the_sampler_and_the_table(recording: Even
     assert "8 ms" in why and ("successor" in why) == approximate
     manager = config.setup(device="cpu").datamanager
     pairs = manager.pair_sampler.sample(1000, torch.Generator().manual_seed(0))
-    event_times = set(recording.index.times.tolist())
-    shifted = [start - 8_000_000 in event_times for start, end in zip(pairs.start.tolist(), pairs.end.tolist())]
-    assert np.mean(shifted) > 0.9
+    after_event = torch.isin(pairs.start - 8_000_000, recording.index.times)
+    assert (after_event | (pairs.start == pairs.end - 1)).all() and after_event.any()
     silent = manager.silent_sampler.sample(1000, torch.Generator().manual_seed(0))
     before = recording.index.count_until(silent.pixels, silent.start)
     latest = recording.index.times[recording.index.offsets[silent.pixels] + before - 1]

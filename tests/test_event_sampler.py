@@ -8,7 +8,7 @@ from math import sin
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from scipy.stats import chisquare
 
 from enerf_ns import event_sampler
@@ -145,7 +145,7 @@ def fire(signal: Callable[[float], float], end: float, on: float, off: float, re
             time = following
             continue
         level = reference + (on if change > 0 else -off)
-        time = float(brentq(lambda t, level=level: signal(t) - level, time, following))
+        time = root_scalar(lambda t, level=level: signal(t) - level, bracket=(time, following)).root
         events.append((round(time), 1 if change > 0 else -1))
         time += refractory
         reference = signal(time)

@@ -64,7 +64,10 @@ def test_module_of_the_plugin_can_be_imported_first(module):
 
 
 def test_entry_points_are_specifications():
-    assert {point.name for point in ENTRY_POINTS} >= {"enerf", "event-data", "esim-events", "davis-events"}
+    assert {point.name for point in ENTRY_POINTS} >= {
+        "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
+        "tumvie-events", "event-recording",
+    }  # fmt: skip
     for point in ENTRY_POINTS:
         assert type(point.load()).__name__ == SPECIFICATIONS[point.group]
 
@@ -104,5 +107,6 @@ for point in distribution("enerf-ns").entry_points:
         [point.name, SPECIFICATIONS[point.group]] for point in ENTRY_POINTS
     )
     assert (packages / "enerf_ns" / "py.typed").is_file()
+    assert (packages / "enerf_ns" / "scripts" / "page.html").is_file()
     enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr

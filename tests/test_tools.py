@@ -25,6 +25,10 @@ from typing import Any
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import test_eds
+import test_esim_npz
+import test_event_recording
+import test_tum_vie
 import torch
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup
@@ -80,6 +84,38 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+def eds_raw(folder: Path) -> Path:
+    scene = test_eds.plain_scene()
+    test_eds.write_camchain(test_eds.write_raw(folder, scene) / "camchain.yaml", scene.camchain)
+    return folder
+
+
+def eds_prepared(folder: Path) -> Path:
+    return test_eds.prepare(eds_raw(folder), test_eds.plain_scene())
+
+
+def tum_vie(folder: Path, side: str, write: Callable) -> Path:
+    scene = test_tum_vie.make_scene(*test_tum_vie.plain_calibration(), test_tum_vie.plain_poses(), side, False)
+    scene.events[150:, :2] = scene.events[:150, :2]  # a second event for each pixel
+    return write(folder / "mocap-desk2", scene)
+
+
+def esim_npz(folder: Path) -> Path:
+    test_esim_npz.write_views(test_esim_npz.write_npz(folder) / "views")
+    return folder
+
+
+RECORDINGS: dict[str, Callable[[Path], Path]] = {
+    "eds-events": eds_raw,
+    "eds-events, prepared": eds_prepared,
+    "tumvie-events": lambda folder: tum_vie(folder, "left", test_tum_vie.write_raw),
+    "tumvie-events, prepared": lambda folder: tum_vie(folder, "left", test_tum_vie.write_prepared),
+    "tumvie-events --event-camera right": lambda folder: tum_vie(folder, "right", test_tum_vie.write_raw),
+    "esim-npz": esim_npz,
+    "event-recording": lambda folder: test_event_recording.write_recording(folder, ("frames",)),
+}
+
+
 def make_opaque(config: Path) -> Path:
     """Raises the density of a run: a few steps make no surface, and `ns-export pointcloud` waits for one."""
     (file,) = (config.parent / "nerfstudio_models").glob("step-*.ckpt")
@@ -115,6 +151,51 @@ def run_without_frames(home: Path) -> Path:
 def contents(folder: Path) -> dict[Path, str]:
     """Hashes of all files of a folder."""
     return {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_every_format_trains_as_it_is_unpacked(call, name: str, capsys: pytest.CaptureFixture[str]):
+    data = RECORDINGS[name](Path("recording"))
+    before = contents(data)
+    format, *flags = name.split(",")[0].split()
+    settings = ["--steps-per-eval-image", 100, "--pipeline.datamanager.silence-ms", 1]
+    chosen = [format, "--data", data, *flags] if flags else ["event-data", "--data", data]
+    call("ns-train", "enerf", *SMALL, *settings, *chosen, "--depth-range", 0.3, 4)
+    (config,) = Path("outputs").glob("*/enerf/*/config.yml")
+    assert list((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
+    parser = yaml.load(config.read_text(), Loader=yaml.Loader).pipeline.datamanager.dataparser
+    assert getattr(parser, "event_camera", "left") == (flags[-1] if flags else "left")
+    assert (
+        f"({format.removesuffix('-events').replace('tumvie', 'tum_vie').replace('-', '_')})" in capsys.readouterr().out
+    )
+    assert contents(data) == before
+
+
+def test_convert_and_inspect(call, home: Path):
+    call("enerf", "convert", home / "recording", "--output-dir", "own")
+    call("enerf", "inspect", "own")
+    page = Path("inspect-own.html").read_text()
+    assert "data:image/png;base64," in page
+
+
+def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pytest.CaptureFixture[str]):
+    """Of a sequence with as many frames as the preset selects."""
+    Simulate("carpet", Path("carpet"), width=16, height=12, duration=0.5, exposure_ms=5.0, num_frames=42).main()
+    call("ns-train", "enerf", "--preset", "shakeCarpet1", "--data", "carpet", *SMALL)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "21 train and 20 held-out frames" in shown
+    (file,) = Path("outputs").glob("carpet/enerf/*/config.yml")
+    config = yaml.load(file.read_text(), Loader=yaml.Loader)
+    assert config.pipeline.model.contrast_thresholds == (0.2, 0.2)
+    assert config.pipeline.datamanager.dataparser.box == (0.0, 0.0, -1.0, 10.0)
+    call("ns-eval", "--load-config", file, "--output-path", "scores.json", "--render-output-path", "pictures")
+    assert len(list(Path("pictures").iterdir())) == 20
+
+
+def test_a_preset_of_another_sequence_is_refused(home: Path):
+    trained = start("ns-train", "enerf", "--preset", "eds00", "--data", "recording", *SMALL, cwd=home)
+    assert trained.returncode != 0 and "Traceback" not in trained.stderr
+    assert "--preset eds00 selects from the frames 425 to 970" in " ".join(trained.stderr.split())
 
 
 def check_video(path: Path, frames: int, columns: int = 1) -> np.ndarray:

@@ -36,6 +36,26 @@ def align_brightness(
     return aligned, (scale, offset)
 
 
+def align_channels(
+    rendered: Sequence[Float[Tensor, "height width channels"]],
+    recorded: Sequence[Float[Tensor, "height width channels"]],
+) -> tuple[list[Float[Tensor, "height width channels"]], list[tuple[float, float]]]:
+    """As `align_brightness`, but each colour channel by itself: for colour that was learnt from colour events, which
+    leave the log brightness of every channel open (Robust e-NeRF, ICCV 2023, evaluates so).
+
+    Returns:
+        The aligned pictures, clipped to [0, 1], and (scale, offset) of each channel.
+    """
+    aligned, fits = [], []
+    for channel in range(rendered[0].shape[-1]):
+        images, fit = align_brightness(
+            [image[..., channel, None] for image in rendered], [image[..., channel, None] for image in recorded]
+        )
+        aligned.append(images)
+        fits.append(fit)
+    return [torch.cat(channels, dim=-1) for channels in zip(*aligned, strict=True)], fits
+
+
 def image_metrics(
     rendered: Float[Tensor, "height width channels"], recorded: Float[Tensor, "height width channels"]
 ) -> dict[str, float]:
@@ -45,6 +65,7 @@ def image_metrics(
     psnr = -10.0 * torch.log10(torch.mean((rendered - recorded) ** 2).clamp(min=1e-12))
     pictures = [image.movedim(-1, 0)[None] for image in (rendered, recorded)]
     ssim = structural_similarity_index_measure(pictures[0], pictures[1], data_range=1.0)
+    assert isinstance(ssim, Tensor)
     return {"psnr": float(psnr), "ssim": float(ssim)}
 
 

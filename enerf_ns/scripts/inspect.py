@@ -294,7 +294,7 @@ class Inspection:
         hot = self.recording.index.hot_pixels.numpy()
         if len(hot):
             axis.scatter(hot % width, hot // width, s=40, facecolors="none", edgecolors="#22c7e8", linewidths=1.2)
-        axis.set_xlabel("grey: none" + "; circled: hot, left out" * bool(len(hot)))
+        axis.set_xlabel("grey: no events" + "; circled: hot, left out" * bool(len(hot)))
         figure.colorbar(shown, ax=axis, label="events", location="bottom", shrink=0.8)
         return figure
 

@@ -87,26 +87,30 @@ def write_scores_and_picture(
 
 
 def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) -> None:
-    """Frame, render, depth and events of a few held-out frames, side by side."""
+    """Frame, render, depth and events of a few held-out frames, side by side.
+
+    Frames on a clock of their own are shown without events.
+    """
     from matplotlib.figure import Figure
 
-    from enerf_ns.event_dataset import event_picture
+    from enerf_ns.dataparsers.events import event_picture
 
     recording = pipeline.datamanager.eval_dataset.recording
+    titles = ["held-out frame", "render", "depth", *["events"] * (recording.held_out_frames is None)]
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, PICTURE_ROWS).round().astype(int))]
     height, width = chosen[0].depth.shape[:2]
     figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=100)
-    axes = figure.subplots(len(chosen), 4, squeeze=False)
+    axes = figure.subplots(len(chosen), len(titles), squeeze=False)
     near = min(float(view.depth.quantile(0.01)) for view in chosen)
     far = max(float(view.depth.quantile(0.99)) for view in chosen)
-    titles = ("held-out frame", "render", "depth", "events")
     for row, view in zip(axes, chosen, strict=True):
         if view.recorded is not None:
             row[0].imshow(view.recorded.clamp(0, 1).numpy())
         row[1].imshow(view.rendered.clamp(0, 1).numpy())
         depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo", vmin=near, vmax=far)
-        row[3].imshow(event_picture(recording, view.time))
-        row[0].set_ylabel(f"{view.time * 1e-9:.2f} s")
+        if recording.held_out_frames is None:
+            row[3].imshow(event_picture(recording.index, recording.camera, view.time))
+            row[0].set_ylabel(f"{view.time * 1e-9:.2f} s")
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
