@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from enerf_ns.dataparsers.events import EventIndex, EventStream, Survey, sorted_bands
+from enerf_ns.user_cache import user_cache_folder
 
 LAYOUT = 2
 """Counted up when what is stored changes."""
@@ -37,10 +38,10 @@ STALE_SECONDS = 86400
 
 
 def cache_folder() -> Path:
-    """Where the indices lie: $ENERF_CACHE, else enerf-ns in the user's cache folder."""
+    """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder."""
     if "ENERF_CACHE" in os.environ:
         return Path(os.environ["ENERF_CACHE"]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "enerf-ns"
+    return user_cache_folder() / "indices"
 
 
 def entry_name(**made_from: object) -> str:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
-from tokenize import TokenError
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +29,10 @@ LARGEST_RATE = 2e9
 """Events per second that no sensor can send; more of them means that times are in another unit than was thought."""
 
 LARGEST_SPAN_RATIO = 300
-"""Between the spans of events and poses; units of time differ by 1000."""
+"""Between the spans of events or frames and poses; units of time differ by 1000."""
+
+SHORTEST_FRAME_STEP = 1_000_000
+"""Nanoseconds; frames closer together than this are in another unit if they also span hardly any of the poses."""
 
 
 class RecordingError(ValueError):
@@ -271,6 +273,14 @@ class EventRecording:
     def _covered(self, frames: Frames | None, what: str) -> Frames | None:
         if frames is None:
             return None
+        steps, poses = np.diff(frames.times), frames.trajectory.end - frames.trajectory.start
+        too_long = steps.sum() > LARGEST_SPAN_RATIO * poses
+        too_short = len(steps) and np.median(steps) < SHORTEST_FRAME_STEP and LARGEST_SPAN_RATIO * steps.sum() < poses
+        if too_long or too_short:
+            raise RecordingError(
+                f"{self.path} holds {what} within {steps.sum() * 1e-9:.6g} s and poses within {poses * 1e-9:.6g} s, "
+                "which does not fit together; state the times of both in the unit that the format asks for."
+            )
         inside = np.flatnonzero(frames.trajectory.covers(frames.times))
         self._note_dropped(len(frames.times) - len(inside), len(frames.times), what)
         return frames.subset(inside) if len(inside) else None
@@ -343,6 +353,8 @@ def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
     """
     try:
         with Image.open(path) as image:
+            image.verify()  # the checksums of a PNG, which decoding passes over
+        with Image.open(path) as image:
             if image.mode.startswith("I"):
                 return (np.asarray(image).clip(0, 65535) // 256).astype(np.uint8)[..., None]
             grey = image.mode in ("1", "L", "LA")
@@ -350,7 +362,7 @@ def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
                 colors = image.convert("RGBA")
                 image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colors)
             pixels = np.array(image.convert("L" if grey else "RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # of any kind, since Pillow has some of its own for what is damaged
         raise _unreadable(path, "an image", error) from error
     return pixels[..., None] if grey else pixels
 
@@ -376,7 +388,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return image.size
-    except (OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # of any kind, since Pillow has some of its own for what is damaged
         raise _unreadable(path, "an image", error) from error
 
 
@@ -392,7 +404,7 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
     """
     try:
         array = np.load(path, mmap_mode=mmap_mode)  # type: ignore[arg-type]
-    except (OSError, ValueError, TypeError, EOFError, SyntaxError, TokenError) as error:
+    except Exception as error:  # of any kind, since NumPy parses the header as Python
         raise _unreadable(path, "a NumPy array (.npy)", error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")

@@ -137,11 +137,12 @@ def read_poses(
 
 
 def _is_number(cell: str) -> bool:
+    """Whether it is a number as all programs write them; Python's may have underscores and digits of any script."""
     try:
         float(cell)
     except ValueError:
         return False
-    return True
+    return cell.isascii() and "_" not in cell
 
 
 def _not_a_number(path: Path, number: int, cell: str) -> RecordingError:

@@ -8,6 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from enerf_ns.user_cache import user_cache_folder
+
 
 def make_ffmpeg_available() -> None:
     """Lets this process, and those it starts, find a program named `ffmpeg`.
@@ -18,7 +20,7 @@ def make_ffmpeg_available() -> None:
     if shutil.which("ffmpeg") is not None:
         return
     try:
-        folder = _user_cache_folder() / "enerf-ns" / "bin"
+        folder = user_cache_folder() / "bin"
         if shutil.which("ffmpeg", path=str(folder)) is None:
             _link_ffmpeg_into(folder)
     except (ImportError, OSError, RuntimeError):  # RuntimeError: no home folder, or no binary for this platform
@@ -38,11 +40,3 @@ def _link_ffmpeg_into(folder: Path) -> None:
         else:
             link.symlink_to(get_ffmpeg_exe())
         os.replace(link, folder / name)  # atomic: another process sees the old program or the new one
-
-
-def _user_cache_folder() -> Path:
-    if "XDG_CACHE_HOME" in os.environ:
-        return Path(os.environ["XDG_CACHE_HOME"])
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
