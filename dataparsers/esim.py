@@ -101,8 +101,8 @@ def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
 
 def _read_simulation(path: Path) -> dict:
     try:
-        simulation = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        simulation = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path} cannot be read as JSON ({error}); simulate it again or remove it.") from error
     if not isinstance(simulation, dict):
         raise RecordingError(f"{path} holds a {type(simulation).__name__}, but a JSON object was expected.")
@@ -114,7 +114,7 @@ def _two_positive(path: Path, simulation: dict, name: str) -> tuple[float, float
     if value is None:
         return None
     if not (isinstance(value, list) and len(value) == 2 and all(_is_positive(number) for number in value)):
-        raise RecordingError(f"{path} holds {name} = {value}, but two numbers above 0 were expected.")
+        raise RecordingError(f"{path} holds {name} = {value!r}, but two numbers above 0 were expected.")
     return float(value[0]), float(value[1])
 
 
@@ -123,16 +123,12 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
     if camera is None:
         return None
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    try:
-        width, height, fx, fy, cx, cy = (float(camera[name]) for name in names)
-        good = _is_size(width) and _is_size(height) and 0 < fx < np.inf and 0 < fy < np.inf
-        good = good and np.isfinite([cx, cy]).all()
-    except (TypeError, KeyError, ValueError):
-        good = False
-    if not good:
+    values = [camera.get(name) for name in names] if isinstance(camera, dict) else []
+    if not (values and all(map(_is_number, values)) and all(map(_is_size, values[:2])) and min(values[2:4]) > 0):
         raise RecordingError(
-            f"{path} holds camera = {camera}, but the numbers {', '.join(names)} in pixels were expected."
+            f"{path} holds camera = {camera!r}, but the numbers {', '.join(names)} in pixels were expected."
         )
+    width, height, fx, fy, cx, cy = map(float, values)
     return Camera(int(width), int(height), fx, fy, cx, cy)
 
 
@@ -179,17 +175,20 @@ def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
 def _events(file: Path, rows: np.ndarray, start: int) -> Events:
     """Events from rows (n, 4) x y t_ns p of any type of number; `start` is the number of the first row in its file."""
     limits = (("x", 2**31), ("y", 2**31), ("t", 2**62), ("p", 2**31))
+    is_float = rows.dtype.kind == "f"
     for column, (name, limit) in zip(rows.T, limits, strict=False):
-        if rows.dtype.kind == "f":
-            good = (np.abs(column) < limit) & ((column == np.rint(column)) | (name == "t"))
-            if not good.all():
-                bad = int(np.argmin(good))
-                expected = "a finite time in ns" if name == "t" else "a whole number"
-                raise RecordingError(
-                    f"{file}, event {start + bad + 1} holds {name} = {column[bad]:g}, where {expected} was expected."
-                )
+        good = (column > -limit) & (column < limit)
+        if is_float and name != "t":
+            good &= column == np.rint(column)
+        if not good.all():
+            bad = int(np.argmin(good))
+            expected = "a finite time in ns" if name == "t" else "a whole number"
+            raise RecordingError(
+                f"{file}, event {start + bad + 1} holds {name} = {column[bad]:g}, where {expected} was expected."
+            )
     x, y, p = (rows[:, i].astype(np.int32) for i in (0, 1, 3))
-    return Events(x, y, np.rint(rows[:, 2]).astype(np.int64), p)
+    times = np.rint(rows[:, 2]) if is_float else rows[:, 2]
+    return Events(x, y, times.astype(np.int64), p)
 
 
 def _num_rows(file: Path) -> int:
@@ -207,8 +206,12 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
     return str(files[-1])
 
 
-def _is_positive(number: object) -> bool:
-    return isinstance(number, (int, float)) and 0 < number < np.inf
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and -1e9 < value < 1e9
+
+
+def _is_positive(value: object) -> bool:
+    return _is_number(value) and value > 0
 
 
 def _is_size(number: float) -> bool:

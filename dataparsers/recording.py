@@ -31,6 +31,15 @@ LARGEST_RATE = 2e9
 LARGEST_SPAN_RATIO = 300
 """Between the spans of events or frames and poses; units of time differ by 1000."""
 
+SHORTEST_FOCAL_LENGTH, LONGEST_FOCAL_LENGTH = 0.01, 1e4
+"""As a multiple of the width, or of the height: a view of 179 degrees, and one of 0.006."""
+
+FARTHEST_PRINCIPAL_POINT = 10
+"""From the middle of the image, as a multiple of its width or height."""
+
+STEEPEST_DIRECTION = 1e4
+"""Largest x / z and y / z of where a pixel looks."""
+
 SHORTEST_FRAME_STEP = 1_000_000
 """Nanoseconds; frames closer together than this are in another unit if they also span hardly any of the poses."""
 
@@ -130,6 +139,9 @@ class EventRecording:
     def __post_init__(self) -> None:
         states = [(file.resolve(), file.stat()) for file in self.event_files]
         self._source = [(str(path), state.st_size, state.st_mtime_ns) for path, state in states]
+        kinds = (self.frames, self.blurred_frames, self.held_out_frames)
+        for camera in (self.camera, *(frames.camera for frames in kinds if frames is not None)):
+            self._check_camera(camera)
         self.frames = self._covered(self.frames, "frames")
         self.blurred_frames = self._covered(self.blurred_frames, "blurred frames")
 
@@ -269,6 +281,25 @@ class EventRecording:
 
     def _locate(self, index: int) -> str:
         return self.locate_event(index) if self.locate_event else f"{self.path}, event {index + 1},"
+
+    def _check_camera(self, camera: Camera) -> None:
+        axes = ((camera.width, camera.fx, camera.cx), (camera.height, camera.fy, camera.cy))
+        fits = all(
+            SHORTEST_FOCAL_LENGTH * side < focal_length < LONGEST_FOCAL_LENGTH * side
+            and abs(principal_point - side / 2) < FARTHEST_PRINCIPAL_POINT * side
+            for side, focal_length, principal_point in axes
+        )
+        if not fits:
+            raise RecordingError(
+                f"{self.path} holds a camera of {camera.width} x {camera.height} pixels with the focal lengths "
+                f"{camera.fx:g} and {camera.fy:g} and the principal point ({camera.cx:g}, {camera.cy:g}), which fits "
+                "no lens; state all in pixels."
+            )
+        if camera.directions is not None and not np.abs(camera.directions).max() < STEEPEST_DIRECTION:
+            raise RecordingError(
+                f"{self.path} holds a table of where each pixel of a camera looks, in which x / z and y / z reach "
+                f"{np.abs(camera.directions).max():g}, which fits no lens; make it again."
+            )
 
     def _covered(self, frames: Frames | None, what: str) -> Frames | None:
         if frames is None:

@@ -15,6 +15,9 @@ NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 QUATERNION_TOLERANCE = 1e-3
 """Largest error of a quaternion's norm that is renormalised."""
 
+FARTHEST = 1e9
+"""Metres that a camera may be away from the origin; beyond, splines overflow."""
+
 
 def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
     """The cells of a table whose columns are separated by white space.
@@ -61,6 +64,8 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
     """
     times: list[int] = []
     for cell, number in zip(cells, numbers, strict=True):
+        if not _is_number(cell) or not np.isfinite(float(cell)):
+            raise _not_a_number(path, number, cell)
         try:
             time = int((Decimal(cell) * NANOSECONDS[unit]).to_integral_value())
         except (ArithmeticError, ValueError) as error:
@@ -112,13 +117,20 @@ def read_poses(
 
     Raises:
         RecordingError: The file is missing or empty, has fewer than two rows, a column too few or too many, something
-            that is no finite number, times that do not increase, or a quaternion whose norm is off by more than 1e-3.
+            that is no finite number, times that do not increase, a position beyond 1e9 m, or a quaternion whose norm
+            is off by more than 1e-3.
     """
     rows, numbers = read_rows(path, f"t_{unit} px py pz qx qy qz qw")
     if len(rows) < 2:
         raise RecordingError(f"{path} holds {len(rows)} pose, but at least 2 were expected.")
     times = parse_times(path, [row[0] for row in rows], numbers, unit)
     values = parse_numbers(path, [row[1:] for row in rows], numbers)
+    if (np.abs(values) > FARTHEST).any():
+        row, column = np.argwhere(np.abs(values) > FARTHEST)[0]
+        raise RecordingError(
+            f"{path}, line {numbers[row]} holds {rows[row][column + 1]}, but positions within {FARTHEST:g} m and unit "
+            "quaternions were expected."
+        )
     positions, quaternions = values[:, :3], values[:, 3:]
     norms = np.linalg.norm(quaternions, axis=1)
     errors = np.abs(norms - 1.0)

@@ -5,6 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import median_filter
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.events import EventIndex, event_picture, sorted_bands, survey_events
@@ -93,7 +94,9 @@ def test_hot_pixels_are_found_by_their_neighbourhood() -> None:
     stream = [Events(pixels % width, pixels // width, np.arange(len(pixels)), np.ones(len(pixels), np.int8))]
     survey = survey_events(lambda: iter(stream), width, height, 0, len(pixels))
     np.testing.assert_array_equal(survey.counts, counts.ravel())
+    usual = median_filter(counts, size=5, mode="nearest")
     survey.leave_out_hot_pixels(height)
+    np.testing.assert_array_equal(survey.hot_pixels, np.flatnonzero(counts > 10 * np.maximum(usual, 5)))
     assert survey.hot_pixels.tolist() == [0, 3 * width + 4]
     assert survey.num_hot_events == 3500
     ((times, positives),) = sorted_bands(lambda: iter(stream), survey, 2**31)
