@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -90,8 +89,6 @@ MAX_EXTENT = 100.0
 
 MAX_DEPTH_RATIO = 100.0
 """Between farthest and nearest depth; samples along rays are spread over all of it."""
-
-OUTSIDE_POSES = re.compile(r"(.+ of .+) \((.+) %\) lie outside the poses")
 
 
 @dataclass(frozen=True)
@@ -248,11 +245,10 @@ def unusual_rates(
 
 
 def _left_out(recording: EventRecording) -> Iterator[Problem]:
-    for note in recording.notes:
-        found = OUTSIDE_POSES.match(note)
-        if found and float(found[2]) > 100 * MAX_SHARE_OUTSIDE:
+    for what, share in recording.shares_outside_poses.items():
+        if share > MAX_SHARE_OUTSIDE:
             yield Problem(
-                f"{found[1]} ({found[2]} %) lie outside the poses and are left out.",
+                f"{100 * share:.2g} % of the {what} lie outside the poses and are left out.",
                 "Check that poses and events are on one clock, and add the poses that are missing; where the tracker "
                 "only saw a part, nothing else need be done.",
             )

@@ -127,6 +127,8 @@ class EventRecording:
     """Nearest and farthest depth in metres, where the recording knows them."""
     notes: list[str] = field(default_factory=list)
     """What was dropped or renormalised, one sentence each."""
+    shares_outside_poses: dict[str, float] = field(default_factory=dict)
+    """Of "events", "frames" and "blurred frames", the share that is left out, where it is above 0."""
     locate_event: Callable[[int], str] | None = None
     """File and line of event number i of the stream, for error messages."""
     num_events: int | None = None
@@ -320,6 +322,7 @@ class EventRecording:
         if dropped:
             share = f"{100 * dropped / total:.2g} %"
             self.notes.append(f"{dropped:,} of {total:,} {what} ({share}) lie outside the poses and are left out.")
+            self.shares_outside_poses[what] = dropped / total
 
 
 def read_recording(
