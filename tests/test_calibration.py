@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -92,9 +94,8 @@ def lookup_of(camera: Camera) -> Camera:
     rectify_map = undistort(
         pixels.astype(np.float64), camera.matrix, np.array(camera.distortion), R=np.eye(3), P=rectified.matrix
     ).reshape(camera.height, camera.width, 2)
-    centre, focal = [rectified.cx, rectified.cy], [rectified.fx, rectified.fy]
-    values = rectified.width, rectified.height, *focal, *centre
-    return Camera(*values, model="lookup", directions=(rectify_map - centre) / focal)
+    directions = (rectify_map - [rectified.cx, rectified.cy]) / [rectified.fx, rectified.fy]
+    return replace(rectified, model="lookup", directions=directions)
 
 
 @pytest.mark.parametrize(

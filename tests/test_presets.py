@@ -18,7 +18,7 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.losses import event_loss, no_event_loss
-from enerf_ns.presets import PRESETS, Preset, apply_preset, event_time_range
+from enerf_ns.presets import PRESETS, Preset, PresetName, apply_preset, event_time_range
 
 PAPER: Any = enerf_paper.config
 TUNED: Any = enerf.config
@@ -57,7 +57,7 @@ def numbers(cell: str) -> list[int]:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_frames_are_those_of_the_published_config_but_for_what_is_mended(name: str, table: dict):
+def test_frames_are_those_of_the_published_config_but_for_what_is_mended(name: PresetName, table: dict):
     row, preset = table[CONFIGS[name]], PRESETS[name]
     train, held_out = numbers(row["train_idxs"]), numbers(row["val_idxs"])
     overlap = set(train) & set(held_out)
@@ -72,7 +72,7 @@ def test_frames_are_those_of_the_published_config_but_for_what_is_mended(name: s
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_batch_threshold_and_no_event_loss_are_those_of_the_published_config(name: str, table: dict):
+def test_batch_threshold_and_no_event_loss_are_those_of_the_published_config(name: PresetName, table: dict):
     row, preset = table[CONFIGS[name]], PRESETS[name]
     assert preset.event_pairs == int(row["batch_evs"])
     assert preset.frame_rays == int(row["num_rays"])
@@ -86,7 +86,7 @@ def test_batch_threshold_and_no_event_loss_are_those_of_the_published_config(nam
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_box_and_window_are_those_of_the_published_code(name: str, table: dict, reference: str):
+def test_box_and_window_are_those_of_the_published_code(name: PresetName, table: dict, reference: str):
     row, preset = table[CONFIGS[name]], PRESETS[name]
     assert (preset.bound, preset.scale) == tuple(map(float, row["bound/scale"].split("/")))
     stated = re.findall(
@@ -123,7 +123,7 @@ def test_a_held_out_frame_is_no_train_frame_and_both_are_in_order(preset: Preset
     ("name", "train", "held_out"),  # the counts of the paper where it agrees with its configs
     [("spiral1", 30, 32), ("spiral1_sparse", 17, 32), ("spiral1_more_sparse", 9, 32 - 4), ("spiral2", 20, 24)],
 )
-def test_as_many_frames_as_the_paper_counts(name: str, train: int, held_out: int):
+def test_as_many_frames_as_the_paper_counts(name: PresetName, train: int, held_out: int):
     assert len(PRESETS[name].train_frames) == train
     assert len(PRESETS[name].held_out_frames) == held_out
 
@@ -149,7 +149,7 @@ def test_the_corners_of_the_box_are_those_of_the_network_s_cube(preset: Preset):
         ("spiral2", (0.0, 0.0, 0.0, 20.0), 1.0),
     ],
 )
-def test_boxes_in_metres(name: str, box: tuple[float, ...], near: float):
+def test_boxes_in_metres(name: PresetName, box: tuple[float, ...], near: float):
     assert PRESETS[name].box == pytest.approx(box)
     assert PRESETS[name].depth_range[0] == pytest.approx(near)
     assert "-0.0" not in repr(PRESETS[name].box)
@@ -227,7 +227,7 @@ def selections(config: EnerfTrainerConfig) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_fills_in_what_is_left_at_the_default(name: str, recording: Any):
+def test_a_preset_fills_in_what_is_left_at_the_default(name: PresetName, recording: Any):
     config, preset = method_config(name), PRESETS[name]
     lines = apply_preset(config, PAPER, recording)
     filled = selections(config)
@@ -251,7 +251,9 @@ def test_a_preset_fills_in_what_is_left_at_the_default(name: str, recording: Any
 
 
 @pytest.mark.parametrize(("name", "paper_weight"), [("eds11", 1.0), ("mocap1dtrans", 10.0)])
-def test_the_two_event_losses_stand_to_each_other_as_in_the_paper(name: str, paper_weight: float, recording: Any):
+def test_the_two_event_losses_stand_to_each_other_as_in_the_paper(
+    name: PresetName, paper_weight: float, recording: Any
+):
     """Paper: mean (dL - p C)^2 + weight * mean relu(|dL| - C), here up to one common factor."""
     config = method_config(name)
     apply_preset(config, PAPER, recording)
@@ -301,7 +303,7 @@ def test_where_a_preset_has_no_loss_on_silent_pixels_the_method_keeps_its_own(re
         ("model", "no_event_margin", 0.5),
     ],
 )
-def test_what_the_user_set_stands_and_is_named(section: str, name: str, value: Any, recording: Any):
+def test_what_the_user_set_stands_and_is_named(section: str, name: PresetName, value: Any, recording: Any):
     config, plain = method_config("eds11"), method_config("eds11")
     apply_preset(plain, PAPER, recording)
     manager = config.pipeline.datamanager
@@ -351,7 +353,7 @@ def test_with_frames_held_out_by_their_period_the_preset_selects_no_frames(recor
 
 @pytest.mark.parametrize("method", [TUNED, PAPER], ids=["enerf", "enerf-paper"])
 @pytest.mark.parametrize("name", PRESETS)
-def test_applied_twice_it_changes_nothing_more(name: str, method: Any, recording: Any):
+def test_applied_twice_it_changes_nothing_more(name: PresetName, method: Any, recording: Any):
     config = method_config(name, method)
     apply_preset(config, method, recording)
     once = copy.deepcopy(config)
