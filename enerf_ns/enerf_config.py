@@ -133,5 +133,5 @@ enerf_paper = MethodSpecification(
     description="E-NeRF with the sampling and field of the paper (Klenk et al., RA-L 2023).",
 )
 
-METHODS: dict[str, Any] = {method.config.method_name: deepcopy(method.config) for method in (enerf, enerf_paper)}
+METHODS: dict[Any, Any] = {method.config.method_name: deepcopy(method.config) for method in (enerf, enerf_paper)}
 """Settings of the methods as they are before flags change them."""
