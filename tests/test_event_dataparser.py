@@ -111,7 +111,9 @@ def test_an_event_ray_meets_every_point_that_the_pixel_sees_at_that_time(tmp_pat
     """With lens distortion for davis; between two poses."""
     folder = FORMATS[format](tmp_path / format)
     parser = EventDataParserConfig(depth_range=(NEAR, FAR))
-    manager = EnerfDataManagerConfig(data=folder, dataparser=parser).setup(device="cpu", test_mode="val")
+    manager = EnerfDataManagerConfig(data=folder, dataparser=parser, pair_mode="partner").setup(
+        device="cpu", test_mode="val"
+    )
     assert isinstance(manager, EnerfDataManager)
     camera = read_recording(folder).camera
     pixels = np.array([[0, 0], [23, 17], [3, 4], [12, 9]])
@@ -126,7 +128,9 @@ def test_an_event_ray_meets_every_point_that_the_pixel_sees_at_that_time(tmp_pat
 def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
     """At a frame's time, the ray of a pixel is the ray of the picture's element, with the same bookkeeping."""
     folder = write_esim(tmp_path / "esim")
-    manager = EnerfDataManagerConfig(data=folder, dataparser=EventDataParserConfig()).setup(device="cpu")
+    manager = EnerfDataManagerConfig(data=folder, dataparser=EventDataParserConfig(), pair_mode="partner").setup(
+        device="cpu"
+    )
     time = int(manager.train_dataset.frames.times[0])
     frame = manager.train_dataset.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
     event = manager.event_rays(torch.arange(24 * 18), torch.full((24 * 18,), time))
