@@ -78,15 +78,22 @@ def read(folder: Path) -> EventRecording:
 def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], np.ndarray]:
     path = folder / "images.txt"
     if not path.exists():
+        if (folder / "images").is_dir():
+            notes.append("There is a folder images/ but no images.txt with the stamps of frames, so that none is used.")
         return (), np.zeros(0, np.int64)
     rows, numbers = read_rows(path, "t_s path")
     files = tuple(folder / row[1] for row in rows)
-    if not files[0].parent.is_dir():
+    if not any(file.parent.is_dir() for file in files):
         notes.append(f"images.txt lists {len(files)} frames, but there is no folder {files[0].parent.name}/ of images.")
         return (), np.zeros(0, np.int64)
     for file, number in zip(files, numbers, strict=True):
         if not file.is_file():
             raise RecordingError(f"{path}, line {number} lists {file}, which is missing; add it or drop the line.")
+    unlisted = set(files[0].parent.glob(f"*{files[0].suffix}")).difference(files)
+    if unlisted:
+        notes.append(
+            f"{len(unlisted)} images in {files[0].parent.name}/ are not listed in images.txt and are not used."
+        )
     return files, parse_times(path, [row[0] for row in rows], numbers, "s")
 
 

@@ -121,7 +121,8 @@ def read(folder: Path) -> EventRecording:
             rgb_camera = _read_undistorted_camera(folder, 0)
         for file in image_files:
             check_image_size(file, rgb_camera.width, rgb_camera.height)
-        _check_lens(rgb_camera, camchain)
+        if rgb_camera.model != "pinhole":
+            _check_lens(rgb_camera, camchain)
         frames = Frames(image_files, image_times - zero, rgb_camera, trajectory.of_mounted(event_from_rgb))
     if frames is not None or raw_events:
         if camchain is None:
@@ -296,7 +297,10 @@ def _event_camera(path: Path, text: str, camchain: dict) -> str:
 
 
 def _kalibr_camera(path: Path, name: str, entry: dict) -> Camera:
-    model, distortion_model = (str(entry.get(key)).lower() for key in ("camera_model", "distortion_model"))
+    stated = (entry.get("camera_model"), entry.get("distortion_model"))
+    model, distortion_model = (
+        " ".join(name.lower().split()) if isinstance(name, str) else repr(name) for name in stated
+    )
     if model != "pinhole" or distortion_model not in KALIBR_MODELS:
         raise RecordingError(
             f"{path} holds camera_model {model} with distortion_model {distortion_model} of {name}, but pinhole with "
@@ -321,10 +325,11 @@ def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...
         values = np.array(entry.get(key), dtype=float)
     except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
-    if values.shape != shape or not np.isfinite(values).all():
+    is_bool = [isinstance(value, bool) for value in np.array(entry.get(key), dtype=object).flat]
+    if values.shape != shape or not np.isfinite(values).all() or any(is_bool):
+        found = " ".join(str(entry.get(key)).split())[:80]
         raise RecordingError(
-            f"{path} holds {key}: {str(entry.get(key))[:80]} of {name}, but {' x '.join(map(str, shape))} numbers were "
-            "expected."
+            f"{path} holds {key}: {found} of {name}, but {' x '.join(map(str, shape))} numbers were expected."
         )
     return values
 
@@ -346,8 +351,11 @@ def _read_undistorted_camera(folder: Path, number: int) -> Camera:
     """Of the RGB (0) or the event camera (1) after the preparation."""
     path = folder / "calib_undist_calib0.json"
     try:
-        entry = json.loads(path.read_text())["intrinsics_undistorted"][number]
-        fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+        entries = json.loads(path.read_text(encoding="utf-8"))["intrinsics_undistorted"]
+        values = [entries[number][key] for key in ("fx", "fy", "cx", "cy")]
+        if len(entries) != 2 or any(isinstance(value, bool) for value in values):
+            raise ValueError("four numbers of each of two cameras were expected")
+        fx, fy, cx, cy = map(float, values)
     except FileNotFoundError as error:
         raise RecordingError(
             f"{path} is missing; intrinsics_undistorted of the RGB and the event camera was expected."

@@ -29,7 +29,7 @@ from enerf_ns.dataparsers.recording import (
     check_image_size,
     load_array,
 )
-from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.text_tables import parse_array, read_poses, read_times
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
@@ -123,12 +123,15 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
     if camera is None:
         return None
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    values = [camera.get(name) for name in names] if isinstance(camera, dict) else []
-    if not (values and all(map(_is_number, values)) and all(map(_is_size, values[:2])) and min(values[2:4]) > 0):
+    try:
+        width, height, fx, fy, cx, cy = parse_array([camera[name] for name in names], (6,)).tolist()
+        good = _is_size(width) and _is_size(height) and fx > 0 and fy > 0
+    except (TypeError, KeyError, ValueError):
+        good = False
+    if not good:
         raise RecordingError(
             f"{path} holds camera = {camera!r}, but the numbers {', '.join(names)} in pixels were expected."
         )
-    width, height, fx, fy, cx, cy = map(float, values)
     return Camera(int(width), int(height), fx, fy, cx, cy)
 
 
@@ -206,12 +209,8 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
     return str(files[-1])
 
 
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and -1e9 < value < 1e9
-
-
-def _is_positive(value: object) -> bool:
-    return _is_number(value) and value > 0
+def _is_positive(number: object) -> bool:
+    return isinstance(number, (int, float)) and not isinstance(number, bool) and 0 < number < 1e9
 
 
 def _is_size(number: float) -> bool:

@@ -71,6 +71,8 @@ def read(folder: Path) -> EventRecording:
     contrast_thresholds, refractory_period, bayer_pattern = None, 0, None
     if (folder / "esim.conf").exists():
         contrast_thresholds, refractory_period, bayer_pattern = _read_flags(folder / "esim.conf")
+        if (folder / "esim.conf").stat().st_size == 0:
+            notes.append("esim.conf is empty, so that contrast thresholds of 1 are used, as the simulator would.")
     else:
         notes.append(
             "There is no esim.conf, so that contrast thresholds and refractory period are not known, and the sensor is "
@@ -190,7 +192,7 @@ def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
         lines = path.read_text(encoding="utf-8").splitlines()
     flags = dict(DEFAULT_FLAGS)
     for line in map(str.strip, lines):
-        name, _, value = line.lstrip("-").partition("=")
+        name, _, value = line.lstrip("-").replace(" ", "=", 1).partition("=")
         if line.startswith("-") and name.removeprefix("no") == COLOUR:
             flags[COLOUR] = "false" if name.startswith("no") else value or "true"
         elif line.startswith("-"):

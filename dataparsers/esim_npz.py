@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.calibration import Camera, check_rotation
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames, RecordingError, image_size
-from enerf_ns.dataparsers.text_tables import QUATERNION_TOLERANCE
+from enerf_ns.dataparsers.text_tables import FARTHEST, QUATERNION_TOLERANCE, parse_array
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
@@ -146,6 +146,11 @@ def checked_trajectory(
         raise RecordingError(
             f"{path} holds a position or quaternion that is not finite in pose {np.argmin(finite) + 1}, where numbers "
             "were expected."
+        )
+    if np.abs(positions).max() > FARTHEST:
+        raise RecordingError(
+            f"{path} holds a position {np.abs(positions).max():g} m from the origin, but positions within "
+            f"{FARTHEST:g} m were expected."
         )
     norms = np.linalg.norm(quaternions, axis=1)
     errors = np.abs(norms - 1.0)
@@ -331,7 +336,7 @@ def _view_camera(path: Path, content: dict, width: int, height: int) -> Camera:
     if "camera_angle_x" not in content and "intrinsics" in content:
         return checked_camera(path, width, height, _matrix(path, content, "intrinsics", (3, 3)), "", np.zeros(0))
     angle = content.get("camera_angle_x")
-    if not isinstance(angle, (int, float)) or not 0 < angle < np.pi:
+    if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not 0 < angle < np.pi:
         raise RecordingError(
             f"{path} holds camera_angle_x = {angle!r}, but the angle of view in radians, or intrinsics, was expected."
         )
@@ -341,12 +346,10 @@ def _view_camera(path: Path, content: dict, width: int, height: int) -> Camera:
 
 def _matrix(path: Path, entry: dict, name: str, shape: tuple[int, int], where: str = "") -> np.ndarray:
     try:
-        matrix = np.array(entry.get(name), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape != shape or not np.isfinite(matrix).all():
-        raise RecordingError(f"{path} holds no {name}{where} of {shape[0]} x {shape[1]} numbers, which was expected.")
-    return matrix
+        return parse_array(entry.get(name), shape)
+    except ValueError as error:
+        expected = f"{shape[0]} x {shape[1]} numbers, which was expected"
+        raise RecordingError(f"{path} holds no {name}{where} of {expected}.") from error
 
 
 def _find_image(views: Path, name: object) -> Path | None:

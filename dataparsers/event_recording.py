@@ -39,7 +39,7 @@ from enerf_ns.dataparsers.recording import (
     check_image_size,
     load_array,
 )
-from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.text_tables import parse_array, read_poses, read_times
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
@@ -484,12 +484,9 @@ def _parse_int(path: Path, name: str, value: object, smallest: int, largest: int
 
 def _numbers(path: Path, name: str, value: object, shape: tuple[int, ...], expected: str) -> Float64[np.ndarray, "..."]:
     try:
-        array = np.array(value)
-    except ValueError:  # lists of different lengths
-        array = np.array(None)
-    if array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
-        raise RecordingError(f"{path} holds {name} = {_short(value)}, but {expected} were expected.")
-    return array.astype(np.float64)
+        return parse_array(value, shape)
+    except ValueError as error:
+        raise RecordingError(f"{path} holds {name} = {_short(value)}, but {expected} were expected.") from error
 
 
 def _list(names: tuple[str, ...] | list[str]) -> str:

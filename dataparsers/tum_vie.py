@@ -396,7 +396,7 @@ def _read_calibration(path: Path) -> dict:
 
 def _entry(path: Path, calibration: dict, name: str, index: int) -> dict:
     entries = calibration.get(name)
-    if not isinstance(entries, list) or len(entries) <= index or not isinstance(entries[index], dict):
+    if not isinstance(entries, list) or len(entries) != 4 or not isinstance(entries[index], dict):
         raise RecordingError(
             f"{path} holds no {name} of camera {index}, but a calibration of four cameras (0 to 3) was expected."
         )
@@ -428,7 +428,7 @@ def _fisheye(path: Path, calibration: dict, index: int) -> Camera:
     fx, fy, cx, cy, *distortion = _numbers(path, parameters, "fx fy cx cy k1 k2 k3 k4", what)
     _check_focal_lengths(path, fx, fy, what)
     sizes = calibration.get("resolution")
-    size = sizes[index] if isinstance(sizes, list) and len(sizes) > index else None
+    size = sizes[index] if isinstance(sizes, list) and len(sizes) == 4 else None
     if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int and 0 < side < 2**16 for side in size)):
         raise RecordingError(
             f"{path} holds resolution[{index}] = {size}, but width and height in pixels were expected."
