@@ -12,6 +12,7 @@ import pytest
 import torch
 from nerfstudio.scripts.train import _set_random_seed
 from PIL import Image
+from recordings import joined
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
@@ -22,7 +23,7 @@ from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.evaluation.metrics import align_channels
 from enerf_ns.event_camera import inverse_linlog, linlog
 from enerf_ns.scene_choices import fill_in_choices
-from enerf_ns.simulator.esim import EventGenerator
+from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 32.0
 PATTERN = "GRBG"
@@ -60,12 +61,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
     seen = np.array(["RGB".index(letter) for letter in PATTERN]).reshape(2, 2)[row % 2, column % 2]
 
     def mosaic(time: int) -> np.ndarray:
-        return np.take_along_axis(picture(time), seen[..., None], axis=-1)[..., 0]
+        return np.exp(np.take_along_axis(picture(time), seen[..., None], axis=-1)[..., 0])
 
-    generator = EventGenerator(mosaic(0), 0, THRESHOLDS)
+    sensor = EventSensor(SensorSettings(contrast_thresholds=THRESHOLDS, log_eps=1e-9), mosaic(0), 0)
     times = np.arange(1, 1001) * (SECOND // 1000)
-    rows = np.concatenate([generator.advance(mosaic(time), time) for time in times.tolist()])
-    np.save(folder / "events.npy", rows)
+    events = joined(sensor.advance(mosaic(time), time) for time in times.tolist())
+    np.save(folder / "events.npy", np.stack([events.x, events.y, events.t, events.p], axis=1))
 
     camera = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     pose_times = np.arange(0, 101) * (SECOND // 100)
@@ -77,7 +78,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
         Image.fromarray((255.0 * brightness).round().astype(np.uint8)).save(file)
 
     def stream() -> Iterator[Events]:
-        yield Events(*rows.T)
+        yield events
 
     return EventRecording(
         path=folder,

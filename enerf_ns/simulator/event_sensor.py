@@ -1,0 +1,468 @@
+"""Events from pictures of brightness: the pixels of an event sensor, ideal but for what its settings say.
+
+The signal of a pixel is its log brightness, linear in time between two pictures. A pixel memorises a level of its
+signal; when the signal has risen above it by the on threshold, or fallen below it by the off threshold, the pixel fires
+and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018, section 3.1), and every
+crossing is timed to the nanosecond. The rest is off by default:
+
+* Refractory period: after an event a pixel neither fires nor memorises for that long; then it memorises the signal of
+  that moment (Low, Lee: Robust e-NeRF, ICCV 2023).
+* Finite bandwidth: the signal is log brightness behind a low pass of first order, solved in closed form between two
+  pictures; the cut-off grows with brightness (of the middle between them).
+* Leak: the memorised level falls steadily, so that a pixel that sees nothing change fires on events.
+* Shot noise and hot pixels: events of a Poisson process, of either polarity equally often. They, too, make a pixel
+  memorise its signal and wait for the refractory period.
+* Read-out: jitter of the times, and a bus that carries only so many events.
+
+Brightness that makes the photoreceptor faster and less noisy, leak and shot noise that resets a pixel are those of
+v2e (Hu, Liu, Delbruck: v2e: From Video Frames to Realistic DVS Events, CVPRW 2021).
+
+Randomness is a function of the seed, the pixel and a running number of its noise or its events. It depends neither on
+threads nor on how many pictures there are: events of static scenes are the same however often a picture is given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+
+from enerf_ns.dataparsers.recording import Events, RecordingError
+
+READOUT_QUEUE = 1000
+"""Events that may wait for the bus; one that comes while so many wait is lost."""
+
+CUT_JITTER = 6
+"""Standard deviations that jitter is cut at."""
+
+TOLERANCE = 1e-9
+"""Log brightness by which a threshold may be missed and still be reached: far above rounding, far below any noise."""
+
+NEVER = 2**62
+"""Nanoseconds."""
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """What an event sensor is like; by default ideal.
+
+    Raises:
+        RecordingError: A setting is out of its range.
+    """
+
+    contrast_thresholds: tuple[float, float] = (0.25, 0.25)
+    """Change of log brightness that makes an on event, and an off event."""
+    threshold_spread: float = 0.0
+    """Standard deviation of the thresholds from pixel to pixel, as a share of the threshold; they stay as they are."""
+    refractory_period: int = 0
+    """Nanoseconds that a pixel is deaf for after an event; then it memorises what it sees."""
+    leak_rate: float = 0.0
+    """On events per second of a pixel that sees nothing change; its memory falls by this times its on threshold."""
+    shot_noise_rate: float = 0.0
+    """Noise events per second and pixel in the dark; falls linearly to a quarter at brightness 1 and above."""
+    hot_pixels: float = 0.0
+    """Share of the pixels that are hot: instead of shot noise they have noise of the hot pixel rate."""
+    hot_pixel_rate: float = 1000.0
+    """Noise events per second of a hot pixel, whatever it sees."""
+    cutoff_frequency: float = 0.0
+    """Of the photoreceptor at brightness 1, in Hz; at brightness b it is (255 b + 20) / 275 of it. 0: no low pass."""
+    timestamp_jitter: float = 0.0
+    """Standard deviation of the times of events in nanoseconds; they are put in order after that."""
+    readout_rate: float = 0.0
+    """Events per second that the bus carries; they wait in a queue for it, and are lost when that is full. 0: all."""
+    log_eps: float = 0.001
+    """Added to brightness before its logarithm is taken."""
+    seed: int = 0
+    """Draws all that is random."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "contrast_thresholds":
+                fine, expected = len(value) == 2 and all(0 < c < math.inf for c in value), "two numbers above 0"
+            elif field.name == "log_eps":
+                fine, expected = 0 < value < math.inf, "above 0"
+            elif field.name == "hot_pixels":
+                fine, expected = 0 <= value <= 1, "between 0 and 1"
+            else:
+                fine, expected = 0 <= value <= 1e15, "at least 0 and at most 1e15"
+            if not fine:
+                raise RecordingError(f"{field.name} is {value}, but must be {expected}.")
+
+
+class _Pixels(NamedTuple):
+    """What every pixel is and remembers. Levels are signal plus leak: the memory stays and the signal rises instead."""
+
+    on: np.ndarray
+    off: np.ndarray
+    leak: np.ndarray
+    """Per nanosecond."""
+    noise_rate: np.ndarray
+    """Per nanosecond, at brightness 0."""
+    hot: np.ndarray
+    signal: np.ndarray
+    """At the time of the last picture, without leak."""
+    memorised: np.ndarray
+    rises: np.ndarray
+    falls: np.ndarray
+    """Thresholds passed since; the memory is now `memorised + rises * on - falls * off`, without adding up errors."""
+    upper: np.ndarray
+    lower: np.ndarray
+    """Levels of the next on event and the next off event."""
+    awake: np.ndarray
+    """Nanoseconds: until then it is deaf, and then it memorises."""
+    noise: np.ndarray
+    """Nanoseconds: when noise may come next."""
+    num_noise: np.ndarray
+    num_events: np.ndarray
+
+
+class EventSensor:
+    """The pixels of an event sensor, and what each of them memorised.
+
+    Args:
+        settings: what the sensor is like.
+        brightness: [H, W], linear, at least 0, 1 for what frames show as white and no upper limit; the picture that
+            all pixels memorise at the start. Of a sensor with colour filters, each pixel's own channel.
+        time: of that picture, int nanoseconds.
+
+    Attributes:
+        contrast_thresholds: float64 [2, H, W], every pixel's own, on and off.
+        hot_pixels: int64 [N], their pixel numbers (y * width + x), in order.
+
+    Raises:
+        RecordingError: The spread of the thresholds leaves pixels without a threshold, or the picture has a value that
+            is negative or not finite.
+    """
+
+    def __init__(self, settings: SensorSettings, brightness: Float[np.ndarray, "height width"], time: int):
+        self.settings, self.start, self.time = settings, int(time), int(time)
+        self.height, self.width = brightness.shape
+        size = brightness.size
+        threshold_rng, hot_rng = np.random.default_rng(settings.seed).spawn(2)
+        spread = 1 + settings.threshold_spread * threshold_rng.standard_normal((2, *brightness.shape))
+        self.contrast_thresholds = spread * np.array(settings.contrast_thresholds)[:, None, None]
+        without = np.count_nonzero((self.contrast_thresholds <= 0).any(0))
+        if without:
+            raise RecordingError(
+                f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels with a "
+                "threshold of 0 or less; give a smaller one."
+            )
+        self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))
+        self._keys = np.random.SeedSequence(settings.seed).generate_state(4, np.uint64)
+        self._log_brightness = self._logarithm(brightness, self.time)
+
+        on, off = self.contrast_thresholds.reshape(2, size)
+        hot = np.zeros(size, bool)
+        hot[self.hot_pixels] = True
+        signal = self._log_brightness.copy()
+        self._pixels = _Pixels(
+            on=on,
+            off=off,
+            leak=settings.leak_rate * 1e-9 * on,
+            noise_rate=1e-9 * np.where(hot, settings.hot_pixel_rate, settings.shot_noise_rate),
+            hot=hot,
+            signal=signal,
+            memorised=signal.copy(),
+            rises=np.zeros(size, np.int64),
+            falls=np.zeros(size, np.int64),
+            upper=signal + on,
+            lower=signal - off,
+            awake=np.full(size, self.start),
+            noise=np.full(size, self.start),
+            num_noise=np.zeros(size, np.int64),
+            num_events=np.zeros(size, np.int64),
+        )
+        _first_noise(self._pixels, self._keys)
+        self._held = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int8)
+        self._bus_free = 0.0
+        """Nanoseconds since the start."""
+
+    def advance(self, brightness: Float[np.ndarray, "height width"], time: int) -> Events:
+        """Events from the last picture to this one.
+
+        Jitter and a slow bus hold events back; they come with a later call, or from `finish`.
+
+        Args:
+            brightness: as for the first picture.
+            time: int nanoseconds, later than that of the last picture.
+
+        Returns:
+            Events in the order of their times, and after those of the last call: after the last picture (rounded up to
+            the nanosecond) and not after this one. Events of the same time are in the order of pixels.
+
+        Raises:
+            RecordingError: The picture is of another size, not later, or has a value that is negative or not finite.
+        """
+        time = int(time)
+        if brightness.shape != (self.height, self.width):
+            raise RecordingError(
+                f"The picture at {time} ns has the shape {brightness.shape}, but the first one had "
+                f"{(self.height, self.width)}."
+            )
+        if time <= self.time:
+            raise RecordingError(f"The picture at {time} ns must be later than the last one, at {self.time} ns.")
+        settings = self.settings
+        before, after = self._log_brightness, self._logarithm(brightness, time)
+        cutoff = 2e-9 * math.pi * settings.cutoff_frequency
+        fired = _fire(
+            self._pixels, self._keys, before, after, self.start, self.time, time,
+            settings.log_eps, cutoff, int(settings.refractory_period), settings.timestamp_jitter,
+        )  # fmt: skip
+        self.time, self._log_brightness = time, after
+        pixel, times, polarity = (np.concatenate(pair) for pair in zip(self._held, fired, strict=True))
+        return self._read_out(pixel, times, polarity, time - math.ceil(CUT_JITTER * settings.timestamp_jitter))
+
+    def finish(self) -> Events:
+        """The events that were held back, if any. The times of those that would come after the last picture are cut to
+        it, and what still waits for the bus then is lost."""
+        pixel, times, polarity = self._held
+        return self._read_out(pixel, np.minimum(times, self.time), polarity, self.time)
+
+    def _read_out(self, pixel: np.ndarray, times: np.ndarray, polarity: np.ndarray, settled: int) -> Events:
+        """Events that no later one can come before, in the order of time; holds the others back."""
+        order = np.argsort(times, kind="stable")
+        pixel, times, polarity = pixel[order], times[order], polarity[order]
+        count = int(np.searchsorted(times, settled, "right"))
+        sent = slice(count)
+        if self.settings.readout_rate:
+            departures, self._bus_free = _transmit(
+                times[:count], self.start, self.time, self._bus_free, self.settings.readout_rate * 1e-9
+            )
+            count = len(departures)
+            sent = np.flatnonzero(departures >= self.start)
+            times = np.concatenate([departures, times[count:]])
+        self._held = pixel[count:], times[count:], polarity[count:]
+        y, x = np.divmod(pixel[sent].astype(np.int32), np.int32(self.width))
+        return Events(x, y, times[sent], polarity[sent])
+
+    def _logarithm(self, brightness: np.ndarray, time: int) -> np.ndarray:
+        """float64 [H * W]."""
+        flat = brightness.ravel()
+        if not (flat.min() >= 0 and flat.max() < math.inf):
+            pixel = int(np.argmin((flat >= 0) & (flat < math.inf)))
+            raise RecordingError(
+                f"The picture at {time} ns is {flat[pixel]} at x = {pixel % self.width}, y = {pixel // self.width}, "
+                "but brightness must be finite and at least 0."
+            )
+        return np.log(flat.astype(np.float64) + self.settings.log_eps)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fire(  # pragma: no cover
+    pixels, keys, before, after, first, start, end, log_eps, cutoff, refractory_period, jitter
+):
+    """Pixels, times and polarities of all events in (start, end], by pixel; moves the pixels on to `end`.
+
+    Within the interval, times are nanoseconds since its start: `s` is when a pixel's memory was last moved, `awake` and
+    `noise` as in `_Pixels`.
+    """
+    duration = float(end - start)
+    count = 0
+    pixel, times, polarity = np.empty(4096, np.int64), np.empty(4096, np.int64), np.empty(4096, np.int8)
+    for i in range(len(pixels.on)):
+        x0, x1, y0 = before[i], after[i], before[i]
+        decay = 0.0
+        if cutoff > 0:
+            y0 = pixels.signal[i]
+            decay = cutoff * (255 * (np.exp((x0 + x1) / 2) - log_eps) + 20) / 275
+        leak, leaked = pixels.leak[i], pixels.leak[i] * (start - first)
+        curve = y0 + leaked, x0 - y0, (x1 - x0) / duration, leak, decay
+        if cutoff > 0:
+            pixels.signal[i] = _level(curve, duration) - leaked - leak * duration
+        awake, noise = pixels.awake[i] - start, pixels.noise[i] - start
+        if noise > duration and (
+            awake > duration
+            or (
+                awake <= 0
+                and max(x0, x1, y0) + leaked + leak * duration < pixels.upper[i] - TOLERANCE
+                and min(x0, x1, y0) + leaked > pixels.lower[i] + TOLERANCE
+            )
+        ):
+            continue
+
+        turn = _turn(curve)
+        s = 0.0
+        while True:
+            fired = 0
+            stamp = noise
+            stop = min(float(noise), duration)
+            if awake <= stop:
+                if awake > s:
+                    s = float(awake)
+                    pixels.memorised[i] = _level(curve, s)
+                    pixels.rises[i] = pixels.falls[i] = 0
+                    pixels.upper[i] = pixels.memorised[i] + pixels.on[i]
+                    pixels.lower[i] = pixels.memorised[i] - pixels.off[i]
+                fired, s = _next_crossing(curve, turn, s, stop, pixels.lower[i], pixels.upper[i])
+                if fired != 0:
+                    pixels.rises[i] += fired > 0
+                    pixels.falls[i] += fired < 0
+                    level = pixels.memorised[i] + pixels.rises[i] * pixels.on[i] - pixels.falls[i] * pixels.off[i]
+                    pixels.upper[i], pixels.lower[i] = level + pixels.on[i], level - pixels.off[i]
+                    stamp = int(min(max(np.ceil(s - 1e-3), 1.0), duration))
+                    if refractory_period > 0:
+                        awake = stamp + refractory_period
+            if fired == 0:
+                if noise > duration:
+                    break
+                here = np.exp(x0 + (x1 - x0) * (noise / duration)) - log_eps
+                chance = 1.0 if pixels.hot[i] else 1 - 0.75 * min(here, 1.0)
+                draw = _random(keys[1], i, pixels.num_noise[i])
+                if awake <= noise and _uniform(draw) <= chance:
+                    fired = 1 if draw & np.uint64(1) else -1
+                    awake = noise + refractory_period
+                pixels.num_noise[i] += 1
+                noise += _gap(keys[0], i, pixels.num_noise[i], pixels.noise_rate[i])
+                if fired == 0:
+                    continue
+            if count == len(pixel):
+                pixel, times, polarity = _longer(pixel), _longer(times), _longer(polarity)
+            if jitter > 0:
+                stamp += int(np.rint(jitter * _normal(keys, i, pixels.num_events[i])))
+            pixels.num_events[i] += 1
+            pixel[count], times[count], polarity[count] = i, max(start + stamp, first), fired
+            count += 1
+        pixels.awake[i], pixels.noise[i] = start + awake, start + noise
+    return pixel[:count], times[:count], polarity[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _level(curve, s):  # pragma: no cover
+    """Level at s: the low pass of a line, plus leak.
+
+    A curve is, at its start: the level, how far the input is above the output, the slopes of input and of leak, and the
+    angular frequency of the low pass (0: there is none, output is input).
+    """
+    level, pull, slope, leak, decay = curve
+    if decay == 0:
+        return level + (slope + leak) * s
+    done = -np.expm1(-decay * s)
+    return level + leak * s + pull * done + slope * (s - done / decay)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn(curve):  # pragma: no cover
+    """When the level is highest or lowest; infinity if it always rises or always falls."""
+    _, pull, slope, leak, decay = curve
+    remaining = (slope + leak) / (slope - pull * decay)
+    return -np.log(remaining) / decay if decay > 0 and 0 < remaining < 1 else np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next_crossing(curve, turn, s, stop, lower, upper):  # pragma: no cover
+    """First time from s to stop that the level reaches upper (+1) or lower (-1); else 0 and s."""
+    since = s
+    for until in (turn, stop):
+        if not since <= until <= stop:
+            continue
+        level = _level(curve, until)
+        if level >= upper - TOLERANCE:
+            return 1, _reached(curve, upper, since, until)
+        if level <= lower + TOLERANCE:
+            return -1, _reached(curve, lower, since, until)
+        since = until
+    return 0, s
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reached(curve, wanted, low, high):  # pragma: no cover
+    """When a level that only rises, or only falls, from low to high reaches the one wanted.
+
+    With a low pass by Newton's method, and by bisection where that leaves the bracket.
+    """
+    level, pull, slope, leak, decay = curve
+    if decay == 0:
+        return min(max((wanted - level) / (slope + leak), low), high)
+    rises = _level(curve, low) < wanted
+    s = (low + high) / 2
+    for _ in range(200):
+        excess = _level(curve, s) - wanted
+        if (excess < 0) == rises:
+            low = s
+        else:
+            high = s
+        following = s - excess / (leak + slope + (pull * decay - slope) * np.exp(-decay * s))
+        if not low <= following <= high:
+            following = (low + high) / 2
+        if abs(following - s) < 1e-4:
+            return following
+        s = following
+    return s
+
+
+@njit(cache=True, nogil=True)
+def _longer(values):  # pragma: no cover
+    longer = np.empty(2 * len(values), values.dtype)
+    longer[: len(values)] = values
+    return longer
+
+
+@njit(cache=True, nogil=True)
+def _random(key, pixel, number):  # pragma: no cover
+    """64 random bits: place `pixel * 2^32 + number` of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
+    place = (np.uint64(pixel) << np.uint64(32)) + np.uint64(number)
+    bits = key + (place + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True)
+def _uniform(bits):  # pragma: no cover
+    """In (0, 1], of the upper 53 bits."""
+    return (np.float64(bits >> np.uint64(11)) + 1) * 2.0**-53
+
+
+@njit(cache=True, nogil=True)
+def _normal(keys, pixel, number):  # pragma: no cover
+    """By Box and Muller's method."""
+    radius = np.sqrt(-2 * np.log(_uniform(_random(keys[2], pixel, number))))
+    return min(max(radius * np.cos(2 * np.pi * _uniform(_random(keys[3], pixel, number))), -CUT_JITTER), CUT_JITTER)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gap(key, pixel, number, rate):  # pragma: no cover
+    """Nanoseconds, at least 1, from one event of a Poisson process to the next."""
+    return int(max(np.ceil(min(-np.log(_uniform(_random(key, pixel, number))) / rate, 1e18)), 1.0))
+
+
+@njit(cache=True, nogil=True)
+def _first_noise(pixels, keys):  # pragma: no cover
+    for i in range(len(pixels.on)):
+        if pixels.noise_rate[i] > 0:
+            pixels.noise[i] += _gap(keys[0], i, 0, pixels.noise_rate[i])
+        else:
+            pixels.noise[i] = NEVER
+
+
+@njit(cache=True, nogil=True)
+def _transmit(times, first, end, free, rate):  # pragma: no cover
+    """When the bus has carried each event, nanoseconds, and `first - 1` for those that are lost; ends with the last
+    that it carries before `end`.
+
+    Args:
+        times: int64 [N] nanoseconds, when they come, in order.
+        free: when the bus has carried all before them, since `first`.
+        rate: of the bus, events per nanosecond.
+
+    Returns:
+        departures: int64 [M], M <= N.
+        free: after them.
+    """
+    departures = np.empty(len(times), np.int64)
+    for i in range(len(times)):
+        came = float(times[i] - first)
+        if (free - came) * rate >= READOUT_QUEUE:
+            departures[i] = first - 1
+            continue
+        leaves = max(free, came)
+        if leaves > end - first:
+            return departures[:i], free
+        departures[i] = first + int(np.ceil(leaves))
+        free = leaves + 1 / rate
+    return departures, free
