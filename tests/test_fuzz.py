@@ -962,7 +962,7 @@ def test_whole_numbers_keep_all_their_digits(tmp_path: Path):
     write_small_esim(tmp_path / "esim")
     epoch = 1_700_000_000_123_456_789
     for file in (tmp_path / "esim/events").iterdir():
-        np.save(file, np.load(file).astype(np.int64) + [0, 0, epoch, 0])
+        np.save(file, np.load(file).astype(np.int64) + np.array([0, 0, epoch, 0]))
     times, poses = rows_of(tmp_path / "esim/0_poses_all.txt"), tmp_path / "esim/0_poses_all.txt"
     poses.write_text("".join(" ".join([str(int(t) + epoch), *rest]) + "\n" for t, *rest in times))
     found = joined(read_recording(tmp_path / "esim").stream_events())
