@@ -89,11 +89,10 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
     for file, number in zip(files, numbers, strict=True):
         if not file.is_file():
             raise RecordingError(f"{path}, line {number} lists {file}, which is missing; add it or drop the line.")
-    unlisted = set(files[0].parent.glob(f"*{files[0].suffix}")).difference(files)
+    found = set(files[0].parent.glob(f"*{files[0].suffix}"))
+    unlisted = len(found.difference(files))
     if unlisted:
-        notes.append(
-            f"{len(unlisted)} images in {files[0].parent.name}/ are not listed in images.txt and are not used."
-        )
+        notes.append(f"{unlisted} of {len(found)} images are not listed in images.txt, so that they are not used.")
     return files, parse_times(path, [row[0] for row in rows], numbers, "s")
 
 
