@@ -25,7 +25,14 @@ from typing import Any
 import numpy as np
 
 from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.esim_npz import checked_camera, checked_sensor, checked_trajectory, read_views, reading
+from enerf_ns.dataparsers.esim_npz import (
+    checked_camera,
+    checked_sensor,
+    checked_trajectory,
+    listed,
+    read_views,
+    reading,
+)
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
 
@@ -107,13 +114,13 @@ def _messages(path: Path, topic: str) -> Iterator[Any]:
     with reading(path, "a ROS 1 bag"), Reader(path) as bag:
         connections = [connection for connection in bag.connections if connection.topic == topic]
         if not connections:
-            found = ", ".join(sorted({connection.topic for connection in bag.connections})[:12])
-            raise RecordingError(f"{path} lacks the topic {topic}, and holds {found or 'none'}; record it as well.")
+            found = listed({connection.topic for connection in bag.connections})
+            raise RecordingError(f"{path} lacks the topic {topic}, and holds {found}; record it as well.")
         for connection in connections:
             if connection.msgtype != MESSAGE_TYPES[topic]:
                 raise RecordingError(
-                    f"{path} holds messages of type {connection.msgtype} on {topic}, but {MESSAGE_TYPES[topic]} was "
-                    "expected."
+                    f"{path} holds messages of type {listed([connection.msgtype])} on {topic}, but "
+                    f"{MESSAGE_TYPES[topic]} was expected."
                 )
         for connection, _, data in bag.messages(connections):
             if connection.topic != topic:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Literal
@@ -117,6 +117,12 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         raise RecordingError(
             f"{path} cannot be read as {expected} ({reason}); copy it again from its source."
         ) from error
+
+
+def listed(names: Iterable[str]) -> str:
+    """The first of some names in order; what cannot be printed, as names in damaged files may hold, becomes "?"."""
+    text = ", ".join(sorted(names)[:12]) or "none"
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def checked_trajectory(
@@ -364,8 +370,8 @@ class _StoredArray:
 
     def __init__(self, path: Path, archive: ZipFile, name: str, kind: str, shape: tuple[int | None, ...]):
         if f"{name}.npy" not in archive.namelist():
-            found = ", ".join(sorted(entry.removesuffix(".npy") for entry in archive.namelist())[:12])
-            raise RecordingError(f"{path} lacks the array {name}, and holds {found or 'none'}; save it with {name}.")
+            found = listed(entry.removesuffix(".npy") for entry in archive.namelist())
+            raise RecordingError(f"{path} lacks the array {name}, and holds {found}; save it with {name}.")
         self._stream = archive.open(f"{name}.npy")
         version = np.lib.format.read_magic(self._stream)
         if version not in ((1, 0), (2, 0)):

@@ -356,6 +356,22 @@ def _npy_header(dtype: type, length: int) -> bytes:
     return b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little") + header.ljust(117).encode() + b"\n"
 
 
+def read_cameras(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
+    """The camera of the events, that of the frames, and the pose of the latter in the axes of the former.
+
+    Args:
+        path: JSON file with camera and, if another one takes the frames, frame_camera, as in recording.json.
+
+    Raises:
+        RecordingError: The file is missing or holds no such cameras.
+    """
+    about = read_json(path)
+    camera = parse_camera(path, "camera", about.get("camera"))
+    if "frame_camera" not in about:
+        return camera, camera, np.eye(4)
+    return camera, *_parse_frame_camera(path, about["frame_camera"])
+
+
 def _parse_frame_camera(path: Path, value: object) -> tuple[Camera, Float64[np.ndarray, "4 4"]]:
     """The camera of the frames, and its pose in the axes of the event camera."""
     if not isinstance(value, dict) or MOUNTING_KEY not in value:

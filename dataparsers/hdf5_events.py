@@ -200,7 +200,7 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
     for i in range(properties.get_nfilters()):
         number, _, parameters, name = properties.get_filter(i)
         if not h5py.h5z.filter_avail(number):
-            called = f" ({name.decode(errors='replace')})" if name else ""
+            called = f" ({name.decode(errors='replace')!r})" if name else ""
             raise RecordingError(
                 f"{path} is compressed by the HDF5 filter {number}{called}, which is neither in h5py nor in "
                 "hdf5plugin; install its plugin and set HDF5_PLUGIN_PATH, or repack the file without it."

@@ -31,7 +31,7 @@ WIDTH, HEIGHT = 32, 24
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tenth of a second of a small camera, with grey frames, sharp and blurred, and depth."""
     folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate("shapes", folder, width=WIDTH, height=HEIGHT, duration=0.1, num_frames=11, exposure_ms=5.0).main()
+    Simulate(folder, "shapes", width=WIDTH, height=HEIGHT, duration=0.1, num_frames=11, exposure_ms=5.0).main()
     return folder
 
 

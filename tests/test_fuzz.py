@@ -932,6 +932,11 @@ FOUND: dict[str, tuple[str, Callable[[Path], object], str]] = {
         change("recording.json", "contrast_thresholds", 0, value=True),
         "holds contrast_thresholds = [true, 0.3]",
     ),
+    "line in the name of an array": (
+        "esim_npz",
+        lambda folder: np.savez(folder / "camera_poses.npz", **{"T_wc\nposition": np.zeros(3)}),
+        "holds T_wc?position;",
+    ),
     "truth for an angle": (
         "esim_npz",
         change("views/transforms_test.json", "camera_angle_x", value=True),

@@ -282,5 +282,5 @@ def test_simulated_recordings_have_no_problems(
     tmp_path: Path, scene: Literal["shapes", "carpet"], motion: Literal["shake", "spiral"]
 ):
     folder = tmp_path / "recording"
-    Simulate(scene, folder, motion, duration=0.6, num_frames=24, width=80, height=60).main()
+    Simulate(folder, scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60).main()
     assert find_problems(read_recording(folder)) == []

@@ -77,7 +77,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the recordings and the runs lie: `recording`, and the same `without_frames`."""
     home = tmp_path_factory.mktemp("home")
-    Simulate("shapes", home / "recording", width=WIDTH, height=HEIGHT, duration=0.1, exposure_ms=5.0,
+    Simulate(home / "recording", "shapes", width=WIDTH, height=HEIGHT, duration=0.1, exposure_ms=5.0,
              num_frames=NUM_FRAMES).main()  # fmt: skip
     without = shutil.ignore_patterns("images*", "depth")
     shutil.copytree(home / "recording", home / "without_frames", ignore=without)
@@ -180,7 +180,7 @@ def test_convert_and_inspect(call, home: Path):
 
 def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pytest.CaptureFixture[str]):
     """Of a sequence with as many frames as the preset selects."""
-    Simulate("carpet", Path("carpet"), width=16, height=12, duration=0.5, exposure_ms=5.0, num_frames=42).main()
+    Simulate(Path("carpet"), "carpet", width=16, height=12, duration=0.5, exposure_ms=5.0, num_frames=42).main()
     call("ns-train", "enerf", "--preset", "shakeCarpet1", "--data", "carpet", *SMALL)
     shown = " ".join(capsys.readouterr().out.split())
     assert "21 train and 20 held-out frames" in shown

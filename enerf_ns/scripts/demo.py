@@ -33,7 +33,7 @@ class Demo:
         if recording.exists():
             CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.")
         else:
-            Simulate(scene="shapes", output_dir=recording).main()
+            Simulate(recording, "shapes").main()
 
         config = copy.deepcopy(all_methods["enerf"])
         config.data = config.pipeline.datamanager.data = recording

@@ -1,236 +1,363 @@
-"""`enerf simulate`: a recording of an event camera, with frames, depth and poses, of a scene made from a seed."""
+"""`enerf simulate`: a recording of an event camera, with frames, depth and poses, of anything that has a picture at any
+time: scenes made from a seed, meshes, folders of images, videos, trained runs."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
-from itertools import pairwise
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
 
-import cv2
 import numpy as np
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import track
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers import eds
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.event_recording import read_cameras
+from enerf_ns.dataparsers.recording import Events, RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.esim import EventGenerator
-from enerf_ns.simulator.render import HAS_EMBREE, Renderer
+from enerf_ns.event_camera import color_channels, luma
+from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
+from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
+from enerf_ns.simulator.presets import PRESETS, SimulationPreset
+from enerf_ns.simulator.preview import Preview
+from enerf_ns.simulator.render import Renderer
+from enerf_ns.simulator.sampling import Render, adaptive_renders, render_times
+from enerf_ns.simulator.scene_files import load_scene
 from enerf_ns.simulator.scenes import SCENES
-from enerf_ns.simulator.trajectories import MOTIONS
+from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
+from enerf_ns.simulator.trajectories import MOTIONS, from_file, key_frames
+from enerf_ns.simulator.writers import Setup, Writer, open_writer
 
 CONSOLE = Console(width=120)
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+
+SECONDS, NUM_FRAMES, EXPOSURE_MS, SIZE, FIELD_OF_VIEW = 1.0, 41, 20.0, (160, 120), 60.0
+"""Of a recording for which neither a preset nor a flag states them."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is looked at, by which cameras, from where and how long."""
+
+    events: Source
+    """As the event camera sees it."""
+    frames: Source | None
+    """As the camera of the frames sees it; None: that of the events takes them."""
+    trajectory: Trajectory | None
+    """Of the event camera."""
+    event_camera: Camera
+    frame_camera: Camera
+    event_from_frame: np.ndarray
+    """Pose of the camera of the frames in the axes of that of the events, [4, 4]."""
+    start: int
+    """ns"""
+    end: int
+    """ns"""
 
 
 @dataclass
 class Simulate:
-    """Simulate a recording of an event camera, in the folder layout of E-NeRF's ESIM sequences."""
+    """Simulate a recording of an event camera, with sharp and blurred frames, depth and poses."""
 
-    scene: Annotated[Literal["shapes", "carpet"], tyro.conf.Positional]
-    """What is seen: a room with boxes and balls, or a plane with lines."""
     output_dir: Path
     """New folder for the recording."""
-    motion: Literal["shake", "spiral"] = "shake"
-    """How the camera moves: forward-facing with abrupt turns, or an inward spiral."""
-    duration: float = 1.0
-    """Length of the recording in seconds."""
-    num_frames: int = 41
-    """Frames, at regular times."""
-    exposure_ms: float = 20.0
-    """Exposure of the blurred frames in milliseconds, centred at the time of the frame."""
-    width: int = 160
-    """Of events and frames, in pixels."""
-    height: int = 120
-    """Of events and frames, in pixels."""
-    field_of_view: float = 60.0
-    """Horizontal, in degrees."""
-    contrast_thresholds: tuple[float, float] = (0.25, 0.25)
-    """Change of log brightness that makes an on event, and an off event."""
-    log_eps: float = 0.001
-    """Added to the brightness, which lies in [0, 1], before its logarithm is taken."""
+    scene: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
+    """What is seen: a preset (spiral1, spiral2, shake-moon1, shake-moon2, shake-carpet1), a scene (shapes, carpet,
+    roads, moon, board), a mesh (.glb, .gltf, .obj, .ply, .stl), a scene file (.json), a folder of images, a video."""
+    from_run: Optional[Path] = None  # noqa: UP045
+    """config.yml of a run of Nerfstudio, which is rendered instead of a scene."""
+    motion: Optional[Literal["shake", "spiral"]] = None  # noqa: UP045
+    """How the camera moves: forward-facing with abrupt turns, or an inward spiral. None: as the preset, or shake."""
+    key_frames: Optional[Path] = None  # noqa: UP045
+    """Text file of the camera's places and targets instead, `t x y z tx ty tz` a line: seconds, metres, z up."""
+    trajectory: Optional[Path] = None  # noqa: UP045
+    """Recording, or text file of poses, `t px py pz qx qy qz qw` a line, whose motion is used instead."""
+    trajectory_unit: Literal["s", "us", "ns"] = "s"
+    """Unit of the times of a file of poses."""
+    duration: Optional[float] = None  # noqa: UP045
+    """Length of the recording in seconds. None: that of the preset, the trajectory or the video, or 1."""
+    num_frames: Optional[int] = None  # noqa: UP045
+    """Frames, at regular times. None: as the preset, or 41."""
+    exposure_ms: Optional[float] = None  # noqa: UP045
+    """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
+    preset, or 20."""
+    width: Optional[int] = None  # noqa: UP045
+    """Of events and frames, in pixels. None: as the preset, or 160."""
+    height: Optional[int] = None  # noqa: UP045
+    """Of events and frames, in pixels. None: as the preset, or 120."""
+    field_of_view: Optional[float] = None  # noqa: UP045
+    """Horizontal, in degrees. None: as the preset, or 60."""
+    cameras: Optional[Path] = None  # noqa: UP045
+    """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
+    layout: Literal["esim", "eds", "tum_vie", "event_recording"] = "esim"
+    """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own."""
+    color: bool = False
+    """Frames in colour, where the scene is."""
+    bayer_pattern: Optional[str] = None  # noqa: UP045
+    """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; None: a grey sensor."""
+    frames_per_second: Optional[float] = None  # noqa: UP045
+    """How fast a video, or the images of a folder, were recorded. None: as fast as the video is played."""
+    stamps: Optional[Path] = None  # noqa: UP045
+    """Text file with the times of the images of a folder in seconds, one a line."""
+    gamma: bool = True
+    """Take the images of a folder or a video for sRGB, not for linear brightness."""
     max_displacement: float = 0.5
-    """Pixels that the picture may move at most from one render to the next."""
-    seed: int = 0
-    """Draws the textures and the motion."""
+    """Pixels that a point may move at most from one render to the next."""
+    max_change: float = 0.5
+    """How much log brightness may change from one render to the next before one more is made between them."""
+    preview: bool = False
+    """Write preview.mp4 too: frame, blurred frame, events and depth side by side."""
+    sensor: Annotated[SensorSettings, tyro.conf.arg(name="")] = field(default_factory=SensorSettings)
+    frame: FrameSettings = field(default_factory=FrameSettings)
 
     def main(self) -> None:
         output_dir = self.output_dir.expanduser().resolve()
-        self._check(output_dir)
-        partial = output_dir.with_name(f".{output_dir.name}.partial-{os.getpid()}")
-        partial.mkdir(parents=True)
-        try:
-            summary = self._write(partial)
-            if output_dir.exists():
-                output_dir.rmdir()
-            partial.rename(output_dir)
-        except OSError as error:
-            raise RecordingError(
-                f"{output_dir} could not be written ({error}), and nothing was left there; is the disk full?"
-            ) from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-        CONSOLE.print(f"{summary} are in {output_dir}")
-
-    def _check(self, output_dir: Path) -> None:
-        interval_ms = 1000 * self.duration / self.num_frames
-        for flag, value, fine, expected in (
-            ("--duration", self.duration, self.duration > 0, "seconds above 0"),
-            ("--num-frames", self.num_frames, self.num_frames > 10, "at least 11, which the layout needs"),
-            ("--exposure-ms", self.exposure_ms, 0 < self.exposure_ms <= interval_ms,
-             f"above 0 and at most the time from frame to frame, {interval_ms:.1f} ms"),
-            ("--width", self.width, self.width > 0, "pixels above 0"),
-            ("--height", self.height, self.height > 0, "pixels above 0"),
-            ("--field-of-view", self.field_of_view, 0 < self.field_of_view < 180, "degrees between 0 and 180"),
-            ("--contrast-thresholds", self.contrast_thresholds, min(self.contrast_thresholds) > 0, "two above 0"),
-            ("--log-eps", self.log_eps, self.log_eps > 0, "above 0"),
-            ("--max-displacement", self.max_displacement, self.max_displacement > 0, "pixels above 0"),
-        ):  # fmt: skip
-            if not fine:
-                raise RecordingError(f"{flag} is {value}, but must be {expected}.")
         if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
             raise RecordingError(
                 f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
             )
+        self._check_flags()
+        notes: list[str] = []
+        view = self._view(notes)
+        times, exposures = self._exposures(view)
+        sensor = EventSensor(self.sensor, self._seen(view.events.brightness(view.start)), view.start)
+        setup = Setup(
+            event_camera=view.event_camera,
+            frame_camera=view.frame_camera,
+            event_from_frame=view.event_from_frame,
+            trajectory=view.trajectory,
+            frame_times=times,
+            exposure=exposures.exposure,
+            contrast_thresholds=self.sensor.contrast_thresholds,
+            pixel_thresholds=sensor.contrast_thresholds if self.sensor.threshold_spread else None,
+            refractory_period=self.sensor.refractory_period,
+            bayer_pattern=self.bayer_pattern,
+            frame_settings=replace(self.frame, seed=self.sensor.seed),
+            settings=self._settings(),
+        )
+        output_dir.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            stack.callback(_remove_if_empty, output_dir)
+            writer = stack.enter_context(open_writer(self.layout, output_dir, setup))
+            preview = None
+            if self.preview:
+                size = view.events.width, view.events.height
+                preview = stack.enter_context(Preview(output_dir / "preview.mp4", *size))
+            self._record(view, exposures, sensor, writer, preview)
+        for note in [*notes, *writer.notes]:
+            CONSOLE.print(f"note: {note}", highlight=False)
+        CONSOLE.print(
+            f"{writer.num_events:,} events and {writer.num_frames} frames of {(view.end - view.start) * 1e-9:g} s are "
+            f"in {output_dir}",
+            soft_wrap=True,
+            highlight=False,
+        )
 
-    def _write(self, folder: Path) -> str:
-        """Renders everything into an empty folder and says what is in it."""
-        scene_rng, motion_rng = np.random.default_rng(self.seed).spawn(2)
-        scene = SCENES[self.scene](scene_rng)
-        focal_length = self.width / 2 / np.tan(np.radians(self.field_of_view / 2))
-        renderer = Renderer(scene, self.width, self.height, focal_length)
+    def _check_flags(self) -> None:
+        for flag, value, fine, expected in (
+            ("--duration", self.duration, lambda v: 0 < v < 1e6, "seconds above 0"),
+            ("--num-frames", self.num_frames, lambda v: v > 0, "at least 1"),
+            ("--exposure-ms", self.exposure_ms, lambda v: 0 <= v < np.inf, "milliseconds from 0 on"),
+            ("--width", self.width, lambda v: 0 < v < 2**15, "pixels above 0"),
+            ("--height", self.height, lambda v: 0 < v < 2**15, "pixels above 0"),
+            ("--field-of-view", self.field_of_view, lambda v: 0 < v < 180, "degrees between 0 and 180"),
+            ("--max-displacement", self.max_displacement, lambda v: 0 < v < np.inf, "pixels above 0"),
+            ("--max-change", self.max_change, lambda v: 0 < v < np.inf, "a change of log brightness above 0"),
+            ("--bayer-pattern", self.bayer_pattern, lambda v: len(v) == 4 and set(v) <= set("RGB"),
+             "four letters of R, G and B"),
+        ):  # fmt: skip
+            if value is not None and not fine(value):
+                raise RecordingError(f"{flag} is {value}, but must be {expected}.")
+        if (self.scene is None) == (self.from_run is None):
+            raise RecordingError("Give either what is to be seen, such as shapes or a mesh, or --from-run config.yml.")
 
-        end = round(self.duration * 1e9)
-        trajectory = MOTIONS[self.motion](end, scene.camera, scene.target, motion_rng)
-        frame_times = ((np.arange(self.num_frames) + 0.5) * end / self.num_frames).astype(np.int64)
-        half_exposure = int(self.exposure_ms * 1e6 / 2)
-        opens, closes = frame_times - half_exposure, frame_times + half_exposure
-        stops = np.unique(np.concatenate([frame_times, opens, closes, [end]]))
-        times = render_times(renderer, trajectory, stops, self.max_displacement)
-        poses = trajectory.poses(torch.from_numpy(times)).numpy()
+    @property
+    def _preset(self) -> SimulationPreset | None:
+        return PRESETS.get(self.scene or "")
 
-        for name in ("images", "images_corrupted", "events", "depth"):
-            (folder / name).mkdir()
-        if not HAS_EMBREE:
-            CONSOLE.print("embreex is not installed: casting rays without Embree, several times slower.")
-        generator: EventGenerator | None = None
-        events: list[np.ndarray] = []
-        blurred = last = np.zeros((self.height, self.width))
-        last_time = 0
-        num_events, near, far = 0, np.inf, 0.0
-        with ThreadPoolExecutor(2) as threads:
-            images = _ahead(threads, renderer.brightness, poses)
-            steps = zip(times.tolist(), poses, images, strict=True)
-            for time, pose, image in track(steps, f"Simulating {self.scene}", len(times), console=CONSOLE):
-                exposing = np.flatnonzero((opens <= last_time) & (time <= closes))
-                if exposing.size:
-                    blurred = blurred + (last + image) / 2 * (time - last_time)
-                    if time == closes[exposing[0]]:
-                        _write_image(folder / f"images_corrupted/{exposing[0]:05d}.png", blurred / (2 * half_exposure))
-                        blurred = np.zeros_like(blurred)
+    def _view(self, notes: list[str]) -> View:
+        """What is looked at, by which cameras and from where."""
+        end = None if self.duration is None else round(self.duration * 1e9)
+        path = None if self.scene is None else Path(self.scene).expanduser()
+        if path is not None and (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
+            return self._pictures_view(path, end)
+        if self.from_run is not None:
+            trajectory = self._given_trajectory(notes)
+            camera = self._pinhole() if self.width or self.height or self.field_of_view else None
+            duration = end or round(SECONDS * 1e9)
+            run = TrainedRun(self.from_run.expanduser().resolve(), trajectory, duration, camera)
+            return View(run, None, run.trajectory, run.camera, run.camera, np.eye(4), run.start, _until(run.end, end))
+        assert self.scene is not None
+        scene_rng, motion_rng = np.random.default_rng(self.sensor.seed).spawn(2)
+        preset = self._preset
+        name = preset.scene if preset else self.scene
+        scene = SCENES[name](scene_rng) if name in SCENES else load_scene(self._file(path), scene_rng, notes)
+        if not (self.color or self.bayer_pattern):
+            scene = scene.grey()
+        trajectory = self._given_trajectory(notes)
+        if trajectory is None:
+            seconds = self.duration or (preset.duration if preset else SECONDS)
+            if preset and self.motion is None:
+                trajectory = replace(preset, duration=seconds).trajectory(scene.camera, scene.target, motion_rng)
+            else:
+                motion = MOTIONS[self.motion or "shake"]
+                trajectory = motion(round(seconds * 1e9), scene.camera, scene.target, motion_rng)
+        event_camera, frame_camera, event_from_frame = self._read_cameras()
+        events = RenderedScene(Renderer(scene, event_camera), trajectory)
+        frames = None
+        if frame_camera != event_camera or (event_from_frame != np.eye(4)).any():
+            frames = RenderedScene(Renderer(scene, frame_camera), trajectory.of_mounted(event_from_frame))
+        cameras = event_camera, frame_camera, event_from_frame
+        return View(events, frames, trajectory, *cameras, trajectory.start, _until(trajectory.end, end))
 
-                log_brightness = np.log(self.log_eps + image)
-                if generator:
-                    events.append(generator.advance(log_brightness, time))
-                frame = int(np.searchsorted(frame_times, time))
-                at_frame = frame < self.num_frames and time == frame_times[frame]
-                if at_frame:
-                    _write_image(folder / f"images/{frame:05d}.png", image)
-                    depth = renderer.depth(pose)
-                    np.save(folder / f"depth/{frame:05d}.npy", depth)
-                    near, far = min(near, depth[depth > 0].min()), max(far, depth.max())
-                if at_frame and frame == 0:
-                    generator = EventGenerator(log_brightness, time, self.contrast_thresholds)
-                elif at_frame or time == end:
-                    interval = np.concatenate(events)
-                    np.save(folder / f"events/{frame - 1:05d}.npy", interval)
-                    num_events += len(interval)
-                    events = []
-                last, last_time = image, time
+    def _pictures_view(self, path: Path, end: int | None) -> View:
+        if self.layout != "event_recording":
+            raise RecordingError(
+                f"{path} has pictures and no poses, which --layout {self.layout} needs; give --layout event_recording."
+            )
+        if path.is_dir():
+            stamps = self.stamps and self.stamps.expanduser()
+            source = ImageFolder(path, self.frames_per_second, stamps, gamma=self.gamma, log_eps=self.sensor.log_eps)
+        else:
+            source = Video(path, self.frames_per_second, self.gamma, self.sensor.log_eps)
+        width, height = source.width, source.height
+        focal_length = width / 2 / np.tan(np.radians((self.field_of_view or FIELD_OF_VIEW) / 2))
+        camera = Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+        return View(source, None, None, camera, camera, np.eye(4), source.start, _until(source.end, end))
 
-        for name in ("images", "images_corrupted"):
-            np.savetxt(folder / name / "image_stamps_ns.txt", frame_times, "%d")
-        rows = np.column_stack([trajectory.positions, trajectory.quaternions])
-        with open(folder / "poses_all.txt", "w") as file:
-            file.write("# t_ns px py pz qx qy qz qw\n")
-            for time, row in zip(trajectory.times, rows, strict=True):
-                file.write(f"{time} {' '.join(map(repr, row.tolist()))}\n")
-        frame_poses = trajectory.poses(torch.from_numpy(frame_times)).numpy()
-        size = [self.height, self.width, focal_length]
-        np.save(folder / "poses_bounds.npy", _llff_rows(frame_poses, size, (near, far)))
+    def _file(self, path: Path | None) -> Path:
+        if path is None or not path.exists():
+            raise RecordingError(
+                f"{self.scene} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file "
+                "or folder that exists; give one of these."
+            )
+        return path
+
+    def _given_trajectory(self, notes: list[str]) -> Trajectory | None:
+        if self.key_frames is not None:
+            return key_frames(self.key_frames.expanduser())
+        if self.trajectory is not None:
+            return from_file(self.trajectory.expanduser(), notes, self.trajectory_unit)
+        return None
+
+    def _pinhole(self) -> Camera:
+        preset = self._preset
+        width = self.width or (preset.width if preset else SIZE[0])
+        height = self.height or (preset.height if preset else SIZE[1])
+        angle = self.field_of_view or (preset.field_of_view if preset else FIELD_OF_VIEW)
+        focal_length = float(width / 2 / np.tan(np.radians(angle / 2)))
+        return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+
+    def _read_cameras(self) -> tuple[Camera, Camera, np.ndarray]:
+        """Of events and of frames, and the pose of the latter in the axes of the former."""
+        if self.cameras is not None:
+            return read_cameras(self.cameras.expanduser())
+        if self.layout == "eds":
+            return eds.PUBLISHED_EVENT_CAMERA, eds.PUBLISHED_RGB_CAMERA, eds.PUBLISHED_EXTRINSICS
+        camera = self._pinhole()
+        return camera, camera, np.eye(4)
+
+    def _exposures(self, view: View) -> tuple[np.ndarray, Exposures]:
+        """Times of the frames, evenly spread, and their exposures, in whole microseconds."""
+        preset = self._preset
+        count = self.num_frames or (preset.num_frames if preset else NUM_FRAMES)
+        exposure_ms = self.exposure_ms
+        if exposure_ms is None:
+            exposure_ms = preset.exposure_ms if preset else EXPOSURE_MS
+        length = view.end - view.start
+        times = view.start + ((np.arange(count) + 0.5) * length / count).astype(np.int64) // 1000 * 1000
+        return times, Exposures(times, round(exposure_ms * 500) * 2000)
+
+    def _settings(self) -> dict[str, Any]:
         settings = asdict(self)
-        del settings["output_dir"]
-        principal_point = {"cx": self.width / 2, "cy": self.height / 2}
-        camera = {"width": self.width, "height": self.height, "fx": focal_length, "fy": focal_length, **principal_point}
-        about = {**settings, "camera": camera, "depth_range": [float(near), float(far)], "num_events": num_events}
-        (folder / "simulation.json").write_text(json.dumps(about, indent=2) + "\n")
-        return f"{num_events:,} events and {self.num_frames} frames of {self.duration:g} s"
+        for name in ("output_dir", "preview"):
+            del settings[name]
+        return json.loads(json.dumps(settings, default=str))
+
+    def _seen(self, picture: np.ndarray) -> np.ndarray:
+        """What the pixels of the event camera see of a picture, [height, width]."""
+        if picture.ndim == 2:
+            return picture
+        height, width = picture.shape[:2]
+        if self.bayer_pattern is None:
+            return luma(torch.from_numpy(picture)).numpy()
+        channels = color_channels(self.bayer_pattern, width, height).numpy().reshape(height, width, 1)
+        return np.take_along_axis(picture, channels, axis=2)[..., 0]
+
+    def _record(
+        self, view: View, exposures: Exposures, sensor: EventSensor, writer: Writer, preview: Preview | None
+    ) -> None:
+        def add_events(events: Events) -> None:
+            writer.add_events(events)
+            if preview is not None:
+                preview.add_events(events)
+
+        def add_frame(frame: Frame, source: Source) -> None:
+            depth = source.depth(frame.time) if isinstance(source, RenderedScene | TrainedRun) else None
+            sharp, blurred = writer.add_frame(frame, depth)
+            if preview is not None:
+                preview.add_frame(sharp, blurred, depth)
+
+        stops = np.array([view.start, view.end])
+        others: Iterator[Frame] = iter(())
+        if view.frames is None:
+            stops = np.union1d(stops, exposures.stops)
+        else:
+            others = self._frames(view.frames, exposures)
+        following = next(others, None)
+        columns = (TextColumn("Simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=CONSOLE, transient=True) as progress:
+            task = progress.add_task("", total=1.0)
+            for time, picture, done in self._renders(view.events, stops):
+                if time > view.start:
+                    add_events(sensor.advance(self._seen(picture), time))
+                if view.frames is None:
+                    frame = exposures.add(time, self._shown(picture))
+                    if frame is not None:
+                        add_frame(frame, view.events)
+                while following is not None and following.time <= time:
+                    assert view.frames is not None
+                    add_frame(following, view.frames)
+                    following = next(others, None)
+                progress.update(task, completed=done)
+            add_events(sensor.finish())
+
+    def _renders(self, source: Source, stops: np.ndarray) -> Iterator[Render]:
+        """Pictures at these times, and as many between them as motion and brightness need."""
+        if isinstance(source, Pictures):
+            times = np.union1d(stops, source.times[(source.times > stops[0]) & (source.times < stops[-1])])
+        elif isinstance(source, RenderedScene):
+            camera = source.renderer.camera
+            times = render_times(camera, source.trajectory, source.depth, stops, self.max_displacement)
+        else:
+            assert isinstance(source, TrainedRun)
+            times = render_times(source.camera, source.trajectory, source.depth, stops, self.max_displacement)
+        return adaptive_renders(source.brightness, times, self.max_change, self.sensor.log_eps)
+
+    def _frames(self, source: Source, exposures: Exposures) -> Iterator[Frame]:
+        """The frames of a camera of their own, which is only rendered during exposures."""
+        for stops in np.stack([exposures.opens, exposures.times, exposures.closes], axis=1):
+            for time, picture, _ in self._renders(source, np.unique(stops)):
+                frame = exposures.add(time, self._shown(picture))
+                if frame is not None:
+                    yield frame
+
+    def _shown(self, picture: np.ndarray) -> np.ndarray:
+        """What frames show of a picture."""
+        return picture if self.color or picture.ndim == 2 else luma(torch.from_numpy(picture)).numpy()
 
 
-def render_times(renderer: Renderer, trajectory: Trajectory, stops: np.ndarray, max_displacement: float) -> np.ndarray:
-    """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
-
-    Adds up, from pose to pose of the trajectory, the displacement of the pixel that moves most (of a grid over the
-    picture), and divides the sum evenly between two stops.
-
-    Args:
-        renderer: of the camera that moves.
-        trajectory: its poses.
-        stops: int64 [S] nanoseconds, sorted, times to render at in any case.
-        max_displacement: pixels.
-
-    Returns:
-        int64 [N] nanoseconds, strictly increasing, from the first stop to the last, all stops among them.
-    """
-    poses = trajectory.poses(torch.from_numpy(trajectory.times)).numpy()
-    columns, rows = np.linspace(0, renderer.width - 1, 24), np.linspace(0, renderer.height - 1, 18)
-    rays = renderer.rays(*np.meshgrid(columns, rows)).reshape(-1, 3)
-    displacement = [0.0]
-    for pose, following in pairwise(poses):
-        depth = renderer.depth(pose, rays)[:, None]
-        world = rays * depth @ pose[:, :3].T + pose[:, 3]
-        moved = (world - following[:, 3]) @ following[:, :3]
-        shift = renderer.focal_length * (moved[:, :2] / moved[:, 2:] - rays[:, :2])[depth[:, 0] > 0]
-        displacement.append(np.linalg.norm(shift, axis=1).max(initial=0))
-    travelled = np.cumsum(displacement)
-    at_stops = np.interp(stops, trajectory.times, travelled)
-    times = [stops]
-    for first, second in pairwise(at_stops):
-        steps = int(np.ceil((second - first) / max_displacement))
-        between = np.linspace(first, second, steps + 1)[1:-1]
-        times.append(np.interp(between, travelled, trajectory.times).astype(np.int64))
-    return np.unique(np.concatenate(times))
+def _until(end: int, wanted: int | None) -> int:
+    return end if wanted is None else min(end, wanted)
 
 
-def _ahead(
-    threads: ThreadPoolExecutor, render: Callable[[np.ndarray], np.ndarray], poses: np.ndarray
-) -> Iterator[np.ndarray]:
-    """The pictures of all poses in order, rendered a few ahead of the one that is asked for."""
-    pending: deque[Future[np.ndarray]] = deque()
-    for pose in poses:
-        pending.append(threads.submit(render, pose))
-        if len(pending) > 4:
-            yield pending.popleft().result()
-    while pending:
-        yield pending.popleft().result()
-
-
-def _write_image(path: Path, brightness: np.ndarray) -> None:
-    grey = np.round(255 * brightness).clip(0, 255).astype(np.uint8)
-    if not cv2.imwrite(str(path), np.repeat(grey[..., None], 3, axis=2)):
-        raise RecordingError(f"{path} could not be written; make room on the disk or give another --output-dir.")
-
-
-def _llff_rows(poses: np.ndarray, size: list[float], bounds: tuple[float, float]) -> np.ndarray:
-    """Rows of poses_bounds.npy: [R | t | height width focal] with axes down, right, back, then near and far."""
-    axes = np.stack([poses[:, :, 1], poses[:, :, 0], -poses[:, :, 2], poses[:, :, 3]], axis=2)
-    sizes = np.broadcast_to(np.array(size)[:, None], (len(poses), 3, 1))
-    rows = np.concatenate([axes, sizes], axis=2).reshape(len(poses), 15)
-    return np.column_stack([rows, np.broadcast_to(bounds, (len(poses), 2))])
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()

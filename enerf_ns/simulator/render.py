@@ -1,177 +1,383 @@
-"""Pictures and depth of a scene, by casting rays: on Embree where it is installed, in Numba elsewhere."""
+"""Pictures and depth of a scene, seen by a camera of any model.
+
+The picture is halved again and again, and with it the list of triangles that may be seen in a part of it, down to
+blocks of 64 samples in which every triangle of the list is tried. A sample sees a triangle if its direction lies on the
+inner side of the three seen through an edge and the camera: Olano, Greer: Triangle scan conversion using 2D
+homogeneous coordinates, 1997. That takes no projection and no clipping, so that a camera is a table of directions.
+"""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
 from numba import njit
 
+from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.simulator.scenes import Scene
-from enerf_ns.simulator.textures import SIZE, TEXELS_PER_METRE
 
-HAS_EMBREE = find_spec("embreex") is not None
+GROUP = 4
+"""Samples that take brightness from one place, in their middle, if they all see the same triangle."""
 
-SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)])
-"""Where in a pixel, x and y from its centre, brightness is sampled: a rotated grid, no two in one row or column."""
+SAMPLES = np.stack([np.arange(16), [int(f"{i:04b}"[::-1], 2) for i in range(16)]], axis=1) / 16 - 15 / 32
+"""Where in a pixel, x and y from its centre, triangles are looked for: a Hammersley set, no two in one row or column."""
+SAMPLES = SAMPLES[np.lexsort((SAMPLES > 0).T)]
+
+CENTRE = np.zeros((1, 2))
+
+BLOCK = 256
+"""Samples that a triangle is tried in at once: the loop over them becomes vector instructions."""
+
+SLACK = 1e-4
+"""By how much of its size a part of the picture is taken larger than it is, against rounding."""
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 class Renderer:
-    """Renders a scene for a pinhole camera whose integer pixel indices are pixel centres.
+    """Renders a scene for a camera. A picture takes one thread, and several threads may render at once.
 
     Args:
-        scene: what to render.
-        width, height: size of the picture in pixels.
-        focal_length: of the camera, in pixels; its principal point is (width / 2, height / 2), as E-NeRF's ESIM
-            layout assumes.
+        scene: What to render.
+        camera: Of any model.
+
+    Raises:
+        ValueError: The distortion of the camera has no inverse at some pixel.
     """
 
-    def __init__(self, scene: Scene, width: int, height: int, focal_length: float):
-        self.scene, self.width, self.height, self.focal_length = scene, width, height, focal_length
-        x, y = np.meshgrid(np.arange(width), np.arange(height))
-        self.centre_rays = self.rays(x, y)
-        self.sample_rays = self.rays(x[..., None] + SAMPLES[:, 0], y[..., None] + SAMPLES[:, 1])
-        self.cast = (embree_caster if HAS_EMBREE else numba_caster)(scene)
+    def __init__(self, scene: Scene, camera: Camera):
+        self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
+        self._samples, self._centres = Samples.of(camera, SAMPLES), Samples.of(camera, CENTRE)
 
-    def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Directions through pixel coordinates x and y of one shape, float64 [..., 3], camera axes, z = 1."""
-        rays = np.stack([x - self.width / 2, y - self.height / 2, np.full(x.shape, self.focal_length)], axis=-1)
-        return rays / self.focal_length
-
-    def brightness(self, pose: np.ndarray) -> np.ndarray:
-        """Mean brightness of every pixel's area, float64 [height, width] in [0, 1]; 0 where nothing is hit.
+    def brightness(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width *channels"]:
+        """Mean linear brightness of every pixel's area: [height, width] of a grey scene, [height, width, 3] of others.
 
         Args:
-            pose: float64 [3, 4], camera to world, OpenCV axes, metres.
+            pose: Camera to world, OpenCV axes, metres.
         """
-        scene, angle = self.scene, 1 / (2 * self.focal_length)
-        hits = self.cast(*_world(self.sample_rays.reshape(-1, 3), pose))
-        samples = _shade(*hits, angle, scene.triangles, scene.uv, scene.shade, scene.texture, scene.textures)
-        return samples.reshape(self.sample_rays.shape[:-1]).mean(-1)
+        scene, samples = self.scene, self._samples
+        seen = _see(scene.triangles, np.ascontiguousarray(pose, np.float64))
+        pixels = _shade(
+            seen, samples.x, samples.y, samples.nodes, samples.bounds, samples.sizes,
+            scene.uv, scene.shade, scene.texels_per_metre, scene.texture,
+            scene.texels, scene.texture_start, scene.texture_size, float(scene.background),
+        )  # fmt: skip
+        picture = pixels.reshape(-1, scene.channels)[samples.places]
+        return picture if scene.channels > 1 else picture[..., 0]
 
-    def depth(self, pose: np.ndarray, rays: np.ndarray | None = None) -> np.ndarray:
-        """z-depth in metres along rays of camera axes [..., 3], float32 [...]; 0 where nothing is hit.
+    def depth(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width"]:
+        """z-depth at the centres of the pixels in metres, 0 where nothing is hit.
 
-        Without rays: through the centres of all pixels, [height, width].
+        Args:
+            pose: Camera to world, OpenCV axes, metres.
         """
-        rays = self.centre_rays if rays is None else rays
-        face, _, _, depth = self.cast(*_world(rays.reshape(-1, 3), pose))
-        return np.where(face < 0, 0, depth).astype(np.float32).reshape(rays.shape[:-1])
+        seen, centres = _see(self.scene.triangles, np.ascontiguousarray(pose, np.float64)), self._centres
+        return _measure(seen, centres.x, centres.y, centres.nodes, centres.bounds).reshape(-1)[centres.places]
 
 
-@njit(cache=True, nogil=True)
-def _world(rays, pose):  # pragma: no cover
-    """Origins and directions of rays in the world, float32 [N, 3] each."""
-    origins, directions = np.empty(rays.shape, np.float32), np.empty(rays.shape, np.float32)
-    for i in range(len(rays)):
-        for axis in range(3):
-            origins[i, axis] = pose[axis, 3]
-            directions[i, axis] = pose[axis, 0] * rays[i, 0] + pose[axis, 1] * rays[i, 1] + pose[axis, 2] * rays[i, 2]
-    return origins, directions
+@dataclass(frozen=True)
+class Samples:
+    """Directions (x, y, 1), camera axes, in which a camera is sampled, by square blocks of pixels; and their tree."""
 
+    x: Float32[np.ndarray, "blocks 256"]
+    """Within a block by pixel, row by row, and within a pixel by sample."""
+    y: Float32[np.ndarray, "blocks 256"]
+    sizes: Float32[np.ndarray, "blocks pixels"]
+    """Side of a square as large as the share of a pixel that a group of samples stands for, in x and y."""
+    places: Int64[np.ndarray, "height width"]
+    """Where the pixels of the picture stand among those of all blocks."""
+    nodes: Int32[np.ndarray, "nodes 3"]
+    """Depth first: level (0: one block), the node that follows its last descendant, and its first block."""
+    bounds: Float32[np.ndarray, "nodes 4"]
+    """Least and largest x, least and largest y of each node."""
 
-def embree_caster(scene: Scene):
-    """A function from origins and directions, float32 [N, 3] each, to the first hits.
+    @classmethod
+    def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> Samples:
+        """Samples at these offsets from the centre of every pixel, x and y in pixels; 1, 4, 16 or 64 of them."""
+        directions = camera.pixel_directions()[..., :2]
+        right, down = pixel_steps(camera)
+        samples = directions[:, :, None] + offsets[:, :1] * right[:, :, None] + offsets[:, 1:] * down[:, :, None]
+        size = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) * GROUP / len(offsets))
+        side = round((BLOCK / len(offsets)) ** 0.5)
+        rows, columns = -(-camera.height // side), -(-camera.width // side)
 
-    These are, [N] each: the triangle (-1: none), its barycentric coordinates u and v (weights of the second and the
-    third corner), and how many lengths of the direction the hit is away.
-    """
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
+        def blocks(values: np.ndarray) -> np.ndarray:
+            padding = [(0, rows * side - camera.height), (0, columns * side - camera.width)]
+            values = np.pad(values, padding + [(0, 0)] * (values.ndim - 2), mode="edge")
+            values = values.reshape(rows, side, columns, side, *values.shape[2:]).swapaxes(1, 2)
+            return values.reshape(rows * columns, side**2, *values.shape[4:])[order]
 
-    embree = EmbreeScene()
-    TriangleMesh(embree, scene.triangles)
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        levels = (max(rows, columns) - 1).bit_length() + 1
+        code = np.zeros_like(row)  # Morton: the blocks of every part of the picture follow each other
+        for bit in range(levels):
+            code |= (row >> bit & 1) << (2 * bit + 1) | (column >> bit & 1) << (2 * bit)
+        order = np.argsort(code)
+        code = code[order]
+        samples = blocks(samples).reshape(-1, BLOCK, 2).astype(np.float32)
 
-    def cast(origins, directions):
-        hits = embree.run(origins, directions, output=True)
-        return hits["primID"], hits["u"], hits["v"], hits["tfar"]
+        nodes, bounds = [], []
+        lowest, highest = samples.min(1), samples.max(1)
+        for level in range(levels):
+            first = np.flatnonzero(np.diff(code >> 2 * level, prepend=-1))
+            nodes.append(np.stack([np.full(len(first), level), np.append(first[1:], len(code)), first], axis=1))
+            least = np.minimum.reduceat(lowest, first)
+            most = np.maximum.reduceat(highest, first)
+            slack = SLACK * (most - least)
+            bounds.append(np.stack([least - slack, most + slack], axis=2).reshape(-1, 4))
+        nodes, bounds = np.concatenate(nodes), np.concatenate(bounds)
+        depth_first = np.lexsort((-nodes[:, 0], nodes[:, 2]))
+        nodes = nodes[depth_first]
+        nodes[:, 1] = np.searchsorted(nodes[:, 2], nodes[:, 1])
 
-    return cast
-
-
-def numba_caster(scene: Scene):
-    """What `embree_caster` returns, without Embree: tries the triangles of every surface whose bounding box is hit."""
-    firsts = np.flatnonzero(np.diff(scene.texture, prepend=-1))
-    lower = np.minimum.reduceat(scene.triangles.min(1), firsts) - 1e-4
-    upper = np.maximum.reduceat(scene.triangles.max(1), firsts) + 1e-4
-    bounds = np.append(firsts, len(scene.triangles))
-
-    def cast(origins, directions):
-        return _nearest(origins, directions, scene.triangles, bounds, lower, upper)
-
-    return cast
-
-
-@njit(cache=True, nogil=True)
-def _nearest(origins, directions, triangles, bounds, lower, upper):  # pragma: no cover
-    """Moller, Trumbore: Fast, minimum storage ray-triangle intersection, 1997, behind a slab test of each box."""
-    face, depth = np.full(len(origins), -1), np.full(len(origins), np.inf)
-    us, vs = np.zeros(len(origins)), np.zeros(len(origins))
-    for i in range(len(origins)):
-        ox, oy, oz = float(origins[i, 0]), float(origins[i, 1]), float(origins[i, 2])
-        dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
-        for part in range(len(lower)):
-            enter, leave = 0.0, depth[i]
-            for axis in range(3):
-                slope = 1 / (directions[i, axis] if directions[i, axis] != 0 else 1e-30)
-                a = (lower[part, axis] - origins[i, axis]) * slope
-                b = (upper[part, axis] - origins[i, axis]) * slope
-                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-            if enter > leave:
-                continue
-            for f in range(bounds[part], bounds[part + 1]):
-                ax, ay, az = float(triangles[f, 0, 0]), float(triangles[f, 0, 1]), float(triangles[f, 0, 2])
-                bx, by, bz = triangles[f, 1, 0] - ax, triangles[f, 1, 1] - ay, triangles[f, 1, 2] - az
-                cx, cy, cz = triangles[f, 2, 0] - ax, triangles[f, 2, 1] - ay, triangles[f, 2, 2] - az
-                px, py, pz = dy * cz - dz * cy, dz * cx - dx * cz, dx * cy - dy * cx
-                volume = bx * px + by * py + bz * pz
-                if volume == 0:
-                    continue
-                sx, sy, sz = ox - ax, oy - ay, oz - az
-                u = (sx * px + sy * py + sz * pz) / volume
-                if u < 0 or u > 1:
-                    continue
-                qx, qy, qz = sy * bz - sz * by, sz * bx - sx * bz, sx * by - sy * bx
-                v = (dx * qx + dy * qy + dz * qz) / volume
-                distance = (cx * qx + cy * qy + cz * qz) / volume
-                if v >= 0 and u + v <= 1 and 0 < distance < depth[i]:
-                    face[i], us[i], vs[i], depth[i] = f, u, v, distance
-    return face, us, vs, depth
-
-
-@njit(cache=True, nogil=True)
-def _shade(face, u, v, depth, angle, triangles, uv, shade, texture, textures):  # pragma: no cover
-    """Brightness at every hit: texture at the level of detail of the ray's footprint, times shade; 0: nothing hit."""
-    out = np.zeros(len(face))
-    for i in range(len(face)):
-        f = face[i]
-        if f < 0:
-            continue
-        a, b = u[i], v[i]
-        c = 1 - a - b
-        s = c * uv[f, 0, 0] + a * uv[f, 1, 0] + b * uv[f, 2, 0]
-        t = c * uv[f, 0, 1] + a * uv[f, 1, 1] + b * uv[f, 2, 1]
-        light = c * shade[f, 0] + a * shade[f, 1] + b * shade[f, 2]
-        level = np.log2(min(max(depth[i] * angle * TEXELS_PER_METRE, 1.0), SIZE / 2))
-        low = int(level)
-        out[i] = light * (
-            (low + 1 - level) * _texel(textures[texture[f]], low, s, t)
-            + (level - low) * _texel(textures[texture[f]], low + 1, s, t)
+        numbers = blocks(np.arange(camera.height * camera.width).reshape(camera.height, camera.width))
+        places = np.empty(camera.height * camera.width, np.int64)
+        places[numbers.reshape(-1)[::-1]] = np.arange(numbers.size)[::-1]
+        return cls(
+            np.ascontiguousarray(samples[..., 0]),
+            np.ascontiguousarray(samples[..., 1]),
+            blocks(size).astype(np.float32),
+            places.reshape(camera.height, camera.width),
+            nodes.astype(np.int32),
+            bounds[depth_first],
         )
-    return out
 
 
-@njit(cache=True, nogil=True)
-def _texel(pyramid, level, s, t):  # pragma: no cover
-    """Bilinear look-up at (s, t) metres, repeating at the borders."""
-    size = SIZE >> level
-    start = 4 * (SIZE * SIZE - size * size) // 3
-    x = s * TEXELS_PER_METRE * size / SIZE - 0.5
-    y = t * TEXELS_PER_METRE * size / SIZE - 0.5
-    left, top = int(np.floor(x)), int(np.floor(y))
-    dx, dy = x - left, y - top
-    column, next_column = left & (size - 1), (left + 1) & (size - 1)
-    row, next_row = start + size * (top & (size - 1)), start + size * ((top + 1) & (size - 1))
-    upper = (1 - dx) * pyramid[row + column] + dx * pyramid[row + next_column]
-    lower = (1 - dx) * pyramid[next_row + column] + dx * pyramid[next_row + next_column]
-    return (1 - dy) * upper + dy * lower
+def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
+    """By how much directions (x, y, 1), camera axes, change from a column to the next and from a row to the next.
+
+    By central differences, which for a camera without distortion are exact.
+    """
+    directions = camera.pixel_directions()[..., :2]
+
+    def step(axis: int, of_one: tuple[float, float]) -> np.ndarray:
+        count = directions.shape[axis]
+        if count == 1:
+            return np.full_like(directions, of_one)
+        return np.gradient(directions, axis=axis, edge_order=min(2, count - 1))
+
+    return step(1, (1 / camera.fx, 0)), step(0, (0, 1 / camera.fy))
+
+
+@_compiled
+def _see(triangles, pose):  # pragma: no cover
+    """What tells where a direction (x, y, 1) of camera axes hits each triangle, float32 [F, 16].
+
+    Four vectors: of the direction's inner products with the first three none is negative where it hits the triangle,
+    and they are in the proportion of the weights of the corners; that with the fourth is one over the depth. Elsewhere
+    one of them is negative. An edge that two triangles share has the same vector in both, but for its sign, so that no
+    direction slips through. Then a box around the triangle: least and largest x, least and largest y.
+    """
+    seen = np.zeros((len(triangles), 16), np.float32)
+    corners, normals, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
+    for f in range(len(triangles)):
+        nearest, farthest = np.inf, 0.0
+        box[0], box[1], box[2], box[3] = np.inf, -np.inf, np.inf, -np.inf
+        for k in range(3):
+            x, y, z = triangles[f, k, 0] - pose[0, 3], triangles[f, k, 1] - pose[1, 3], triangles[f, k, 2] - pose[2, 3]
+            for axis in range(3):
+                corners[k, axis] = pose[0, axis] * x + pose[1, axis] * y + pose[2, axis] * z
+            x, y, z = corners[k]
+            nearest, farthest = min(nearest, z), max(farthest, z)
+            if z > 0:
+                box[0], box[1] = min(box[0], x / z), max(box[1], x / z)
+                box[2], box[3] = min(box[2], y / z), max(box[3], y / z)
+        if nearest <= 0 < farthest:
+            box[0], box[1], box[2], box[3] = -np.inf, np.inf, -np.inf, np.inf
+        for k in range(3):
+            a, b = corners[(k + 1) % 3], corners[(k + 2) % 3]
+            for axis in range(3):
+                i, j = (axis + 1) % 3, (axis + 2) % 3
+                normals[k, axis] = a[i] * b[j] - a[j] * b[i]
+        volume = corners[0, 0] * normals[0, 0] + corners[0, 1] * normals[0, 1] + corners[0, 2] * normals[0, 2]
+        if volume == 0:
+            box[0] = np.inf
+            volume = 1.0
+        for axis in range(3):
+            for k in range(3):
+                seen[f, 3 * k + axis] = normals[k, axis] if volume > 0 else -normals[k, axis]
+            seen[f, 9 + axis] = (normals[0, axis] + normals[1, axis] + normals[2, axis]) / volume
+        seen[f, 12:] = box
+    return seen
+
+
+@_compiled
+def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
+    """Depth of every sample, 0 where it sees nothing, [blocks, 256]."""
+    depth, closeness, faces = np.zeros(x.shape, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    for block in _visible(seen, x, y, nodes, bounds, faces, closeness):
+        for k in range(BLOCK):
+            if faces[k] >= 0:
+                depth[block, k] = ONE / closeness[k]
+    return depth
+
+
+@_compiled
+def _visible(seen, x, y, nodes, bounds, faces, closeness):  # pragma: no cover
+    """Goes through the blocks in which triangles may be seen.
+
+    Writes, [256] each, the triangle that every sample of the block sees (-1: none), and one over its depth (0: none).
+    """
+    levels = nodes[0, 0] + 1
+    lists, lengths = np.empty((levels + 1, len(seen)), np.int32), np.zeros(levels + 1, np.int64)
+    lists[levels], lengths[levels] = np.arange(len(seen)), len(seen)
+    node = 0
+    while node < len(nodes):
+        level, after, block = nodes[node]
+        lengths[level] = _select(seen, lists[level + 1, : lengths[level + 1]], bounds[node], lists[level])
+        if lengths[level] == 0:
+            node = after
+            continue
+        if level == 0:
+            faces[:], closeness[:] = -1, 0
+            _try(seen, lists[0, : lengths[0]], x[block], y[block], faces, closeness)
+            yield block
+        node += 1
+
+
+@_compiled
+def _select(seen, candidates, bounds, selected):  # pragma: no cover
+    """Selects triangles whose box meets the bounds and that have a corner of these within each edge; counts them."""
+    left, right, top, bottom = bounds[0], bounds[1], bounds[2], bounds[3]
+    count = 0
+    for f in candidates:
+        s = seen[f]
+        inside = (s[12] <= right) & (s[13] >= left) & (s[14] <= bottom) & (s[15] >= top)
+        for k in range(0, 9, 3):
+            inside &= max(s[k] * left, s[k] * right) + max(s[k + 1] * top, s[k + 1] * bottom) + s[k + 2] >= 0
+        selected[count] = f
+        count += inside
+    return count
+
+
+@_compiled
+def _try(seen, candidates, x, y, faces, closeness):  # pragma: no cover
+    """Which of the triangles the samples of a block see."""
+    for f in candidates:
+        p = seen[f]
+        a0, a1, a2, b0, b1, b2 = p[0], p[1], p[2], p[3], p[4], p[5]
+        c0, c1, c2, d0, d1, d2 = p[6], p[7], p[8], p[9], p[10], p[11]
+        for k in range(BLOCK):
+            near = d0 * x[k] + d1 * y[k] + d2
+            hit = (
+                (a0 * x[k] + a1 * y[k] + a2 >= 0)
+                & (b0 * x[k] + b1 * y[k] + b2 >= 0)
+                & (c0 * x[k] + c1 * y[k] + c2 >= 0)
+                & (near > closeness[k])
+            )
+            closeness[k] = near if hit else closeness[k]
+            faces[k] = f if hit else faces[k]
+
+
+@_compiled
+def _shade(
+    seen, x, y, nodes, bounds, sizes,
+    uv, shade, texels_per_metre, texture, texels, texture_start, texture_size, background,
+):  # fmt: skip  # pragma: no cover
+    """Mean over the samples of a pixel of shade times texture, [blocks, pixels, C].
+
+    A step is taken for all places of a block before the next one, so that it becomes vector instructions.
+    """
+    channels, pixels = texels.shape[1], sizes.shape[1]
+    picture = np.full((len(x), pixels, channels), np.float32(background))
+    faces, closeness = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    px, py, face = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    pixel, share = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    s, t, light = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty((channels, BLOCK), np.float32)
+    side, start, blend = np.empty((2, BLOCK), np.int32), np.empty((2, BLOCK), np.int64), np.empty(BLOCK, np.float32)
+    fine, coarse = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    for block in _visible(seen, x, y, nodes, bounds, faces, closeness):
+        count = _places(x[block], y[block], faces, pixels, px, py, face, pixel, share)
+        blends = False
+        end = 0
+        while end < count:
+            begin, f = end, face[end]
+            while end < count and face[end] == f:
+                end += 1
+            _interpolate(seen[f], uv[f], shade[f], px, py, begin, end, s, t, light)
+            first, finest = texture_start[texture[f]], texture_size[texture[f]]
+            for k in range(begin, end):
+                if k > begin and pixel[k] == pixel[k - 1]:
+                    side[:, k], start[:, k], blend[k] = side[:, k - 1], start[:, k - 1], blend[k - 1]
+                    continue
+                near = seen[f, 9] * px[k] + seen[f, 10] * py[k] + seen[f, 11]
+                footprint = min(sizes[block, pixel[k]] * texels_per_metre[f] / near, np.float32(finest // 2))
+                level = np.log2(footprint) if footprint > ONE else ZERO
+                size = finest >> np.intp(level)
+                blend[k] = level - np.float32(np.intp(level))
+                side[0, k], start[0, k] = size, first + 4 * (finest * finest - size * size) // 3
+                side[1, k], start[1, k] = size, start[0, k]
+                if blend[k] > 0:
+                    side[1, k], start[1, k], blends = size >> 1, start[0, k] + size * size, True
+        for channel in range(channels):
+            _look_up(texels, channel, start[0], side[0], s, t, count, fine)
+            if blends:
+                _look_up(texels, channel, start[1], side[1], s, t, count, coarse)
+                for k in range(count):
+                    fine[k] += blend[k] * (coarse[k] - fine[k])
+            for k in range(count):
+                change = share[k] * (light[channel, k] * fine[k] - np.float32(background))
+                picture[block, pixel[k], channel] += change
+    return picture
+
+
+@_compiled
+def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cover
+    """Where a block takes brightness from, in which triangle, for which pixel and by which share; counts these places.
+
+    One place for every group of samples that see the same triangle, else one for each of the samples.
+    """
+    samples = BLOCK // pixels
+    count = 0
+    for first in range(0, BLOCK, GROUP):
+        f = faces[first]
+        if faces[first + 1] == f and faces[first + 2] == f and faces[first + 3] == f:
+            if f >= 0:
+                px[count] = (x[first] + x[first + 1] + x[first + 2] + x[first + 3]) / np.float32(GROUP)
+                py[count] = (y[first] + y[first + 1] + y[first + 2] + y[first + 3]) / np.float32(GROUP)
+                face[count], pixel[count], share[count] = f, first // samples, np.float32(GROUP) / np.float32(samples)
+                count += 1
+            continue
+        for k in range(first, first + GROUP):
+            if faces[k] >= 0:
+                px[count], py[count], face[count], pixel[count] = x[k], y[k], faces[k], first // samples
+                share[count] = ONE / np.float32(samples)
+                count += 1
+    return count
+
+
+@_compiled
+def _interpolate(seen, uv, shade, x, y, begin, end, s, t, light):  # pragma: no cover
+    """Texture coordinates and light at some places of a triangle."""
+    a0, a1, a2, b0, b1, b2 = seen[0], seen[1], seen[2], seen[3], seen[4], seen[5]
+    c0, c1, c2 = seen[6], seen[7], seen[8]
+    sa, sb, sc, ta, tb, tc = uv[0, 0], uv[1, 0], uv[2, 0], uv[0, 1], uv[1, 1], uv[2, 1]
+    for k in range(begin, end):
+        a, b, c = a0 * x[k] + a1 * y[k] + a2, b0 * x[k] + b1 * y[k] + b2, c0 * x[k] + c1 * y[k] + c2
+        whole = ONE / (a + b + c)
+        s[k], t[k] = (a * sa + b * sb + c * sc) * whole, (a * ta + b * tb + c * tc) * whole
+    for channel in range(len(light)):
+        la, lb, lc = shade[0, channel], shade[1, channel], shade[2, channel]
+        for k in range(begin, end):
+            a, b, c = a0 * x[k] + a1 * y[k] + a2, b0 * x[k] + b1 * y[k] + b2, c0 * x[k] + c1 * y[k] + c2
+            light[channel, k] = (a * la + b * lb + c * lc) / (a + b + c)
+
+
+@_compiled
+def _look_up(texels, channel, start, side, s, t, count, value):  # pragma: no cover
+    """Bilinear in the level of side x side texels from `start` on, repeating at its borders."""
+    for k in range(count):
+        mask, scale = side[k] - np.int32(1), np.float32(side[k])
+        across, along = s[k] * scale - HALF, t[k] * scale - HALF
+        left, top = np.floor(across), np.floor(along)
+        dx, dy = across - left, along - top
+        column, row = np.int32(left) & mask, np.int32(top) & mask
+        right, below = (column + np.int32(1)) & mask, (row + np.int32(1)) & mask
+        upper, lower = start[k] + side[k] * row, start[k] + side[k] * below
+        one, other = texels[np.uintp(upper + column), channel], texels[np.uintp(upper + right), channel]
+        above = one + dx * (other - one)
+        one, other = texels[np.uintp(lower + column), channel], texels[np.uintp(lower + right), channel]
+        value[k] = above + dy * (one + dx * (other - one) - above)

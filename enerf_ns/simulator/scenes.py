@@ -5,68 +5,132 @@ World axes: x right, y away from the camera, z up, in metres. Every camera ray o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
-from trimesh.transformations import rotation_matrix
+from jaxtyping import Float, Float32, Float64, Int64
+from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter, map_coordinates
+from trimesh.transformations import rotation_matrix, transform_points
 
 from enerf_ns.simulator import textures
 
 LIGHT = np.array([-0.4, -0.7, 0.6]) / np.linalg.norm([-0.4, -0.7, 0.6])
 """Direction towards the light, far away."""
 
+LUMINANCE = np.array([[0.2126], [0.7152], [0.0722]], np.float32)
+"""Share of linear red, green and blue in the brightness that a grey camera sees."""
+
 
 @dataclass(frozen=True)
 class Scene:
-    """Diffuse grey triangles whose brightness does not depend on the direction they are seen from."""
+    """Diffuse triangles whose brightness does not depend on the direction they are seen from."""
 
-    triangles: np.ndarray
-    """float32 [F, 3, 3], corners in metres."""
-    uv: np.ndarray
-    """float32 [F, 3, 2], texture coordinates of the corners in metres."""
-    shade: np.ndarray
-    """float32 [F, 3], light that falls on the corners, in (0, 1]; brightness is shade times texture."""
-    texture: np.ndarray
-    """int64 [F], which row of `textures`."""
-    textures: np.ndarray
-    """float32 [T, P], mip pyramids (see `textures.mip_pyramid`)."""
-    camera: np.ndarray
-    """float64 [3], where the camera stands on average, in metres."""
-    target: np.ndarray
-    """float64 [3], what it looks at."""
+    triangles: Float32[np.ndarray, "faces 3 3"]
+    """Corners in metres."""
+    uv: Float32[np.ndarray, "faces 3 2"]
+    """Texture coordinates of the corners: to the right and downwards, 1 is once across the texture, which repeats."""
+    shade: Float32[np.ndarray, "faces 3 channels"]
+    """Light and colour at the corners, at least 0; brightness is shade times texture. One channel is grey, three are
+    linear red, green and blue."""
+    texture: Int64[np.ndarray, " faces"]
+    """Which texture."""
+    texels: Float32[np.ndarray, "texels channels"]
+    """Linear brightness, the mip pyramids of all textures (see `textures.mip_pyramid`) one after the other."""
+    texture_start: Int64[np.ndarray, " textures"]
+    """First row of each texture in `texels`."""
+    texture_size: Int64[np.ndarray, " textures"]
+    """Texels along one side of each texture's finest level, a power of two; 1 for a surface of one colour."""
+    texels_per_metre: Float32[np.ndarray, " faces"]
+    """Of the finest level on each face; 0 where the whole face has one texture coordinate."""
+    camera: Float64[np.ndarray, "3"]
+    """Where the camera stands on average, in metres."""
+    target: Float64[np.ndarray, "3"]
+    """What it looks at."""
+    background: float = 0.0
+    """Brightness where a ray hits nothing."""
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for linear red, green and blue."""
+        return self.texels.shape[1]
+
+    def grey(self) -> Scene:
+        """The scene as a grey camera sees it: with the luminance of its colours (ITU-R BT.709) instead of them.
+
+        That of a product of two colours, of a texture's and a corner's, is taken to be that of the one times that of
+        the other.
+        """
+        if self.channels == 1:
+            return self
+        return replace(self, shade=self.shade @ LUMINANCE, texels=self.texels @ LUMINANCE)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles with one texture; of its arrays some may be grey and others have three channels."""
+
+    triangles: Float[np.ndarray, "faces 3 3"]
+    """Corners in metres."""
+    uv: Float[np.ndarray, "faces 3 2"]
+    """As in `Scene`."""
+    shade: Float[np.ndarray, "faces 3 channels"]
+    """As in `Scene`."""
+    image: Float[np.ndarray, "size size channels"]
+    """Linear brightness of the texture; `size` is a power of two."""
+
+
+def build_scene(surfaces: list[Surface], camera: ArrayLike, target: ArrayLike, background: float = 0.0) -> Scene:
+    """Puts surfaces together; images that are the same array are held once."""
+    channels = max(array.shape[-1] for surface in surfaces for array in (surface.shade, surface.image))
+    images = list({id(surface.image): surface.image for surface in surfaces}.values())
+    number = {id(image): index for index, image in enumerate(images)}
+    pyramids = [textures.mip_pyramid(np.broadcast_to(image, (*image.shape[:2], channels))) for image in images]
+    sizes = np.array([len(image) for image in images])
+    triangles = np.concatenate([surface.triangles for surface in surfaces])
+    uv = np.concatenate([surface.uv for surface in surfaces])
+    texture = np.repeat([number[id(surface.image)] for surface in surfaces], [len(s.triangles) for s in surfaces])
+    area, texels = doubled_areas(triangles), doubled_areas(uv) * sizes[texture] ** 2
+    return Scene(
+        triangles.astype(np.float32),
+        uv.astype(np.float32),
+        np.concatenate([np.broadcast_to(s.shade, (*s.shade.shape[:2], channels)) for s in surfaces]).astype(np.float32),
+        texture.astype(np.int64),
+        np.concatenate(pyramids),
+        np.cumsum([0, *map(len, pyramids[:-1])], dtype=np.int64),
+        sizes.astype(np.int64),
+        np.sqrt(np.divide(texels, area, out=np.zeros_like(area), where=area > 0)).astype(np.float32),
+        np.array(camera, float),
+        np.array(target, float),
+        background,
+    )
+
+
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    """Twice the areas of triangles [F, 3, D] in the plane or in space."""
+    edges = np.diff(corners.astype(np.float64), axis=1)
+    return np.sqrt(np.maximum(np.linalg.det(edges @ edges.swapaxes(1, 2)), 0))
 
 
 def shapes(rng: np.random.Generator) -> Scene:
     """A room with boxes and balls between 1.2 and 2.8 metres away; some of its surfaces have no texture."""
     clouds, fine, mosaic = textures.clouds(rng), textures.clouds(rng, 0.4, 0.05), textures.mosaic(rng)
     bricks, lines, text, plain = textures.bricks(rng), textures.lines(rng), textures.text(rng), textures.plain()
-    left, right, front, back, floor, ceiling = -2.3, 2.3, -1.5, 3.3, -0.85, 1.5
-    room = trimesh.creation.box(bounds=[[left, front, floor], [right, back, ceiling]])
-    room.invert()
-    room.unmerge_vertices()
-
-    def wall(*normal: int) -> trimesh.Trimesh:
-        return trimesh.Trimesh(room.vertices, room.faces[room.face_normals @ normal > 0.5], process=False)
-
-    return _scene(
+    back, floor = 3.3, -0.85
+    return build_scene(
         [
-            (wall(0, -1, 0), bricks, (0.3, 0.6)),
-            (wall(0, 0, 1), clouds, (0.35, 0.65)),
-            (wall(1, 0, 0), plain, (0, 0.5)),
-            (wall(-1, 0, 0), mosaic, (0.3, 0.6)),
-            (wall(0, 0, -1), plain, (0, 0.8)),
-            (wall(0, 1, 0), plain, (0, 0.5)),
-            (_box((0.9, 0.04, 0.6), (-0.1, back, 0.75)), plain, (0, 0.8)),
-            (_box((0.5, 0.5, 0.7), (-0.55, 1.75, floor + 0.35), 25), mosaic, (0.15, 0.95)),
-            (_box((0.45, 0.45, 0.45), (0.55, 1.45, floor + 0.225), -20), text, (0.15, 0.9)),
-            (_box((0.6, 0.4, 1.1), (1.15, 2.4, floor + 0.55), 15), lines, (0.15, 0.9)),
-            (_box((0.3, 0.3, 0.3), (0.0, 2.25, 0.1), 40, 20), plain, (0, 0.8)),
-            (_box((0.4, 0.1, 0.5), (-1.35, 2.7, 0.45), 10), text, (0.15, 0.9)),
-            (_box((0.5, 0.3, 0.25), (0.75, 2.6, 0.75), -30, 10), fine, (0.2, 0.9)),
-            (_ball(0.25, (-0.05, 1.35, floor + 0.25)), lines, (0.2, 0.95)),
-            (_ball(0.22, (0.5, 1.9, 0.3)), plain, (0, 0.35)),
-            (_ball(0.3, (-0.75, 2.2, 0.35)), clouds, (0.2, 0.8)),
+            *_room((-2.3, -1.5, floor), (2.3, back, 1.5), bricks, clouds, plain, mosaic),
+            _surface(_box((0.9, 0.04, 0.6), (-0.1, back, 0.75)), plain, (0, 0.8)),
+            _surface(_box((0.5, 0.5, 0.7), (-0.55, 1.75, floor + 0.35), 25), mosaic, (0.15, 0.95)),
+            _surface(_box((0.45, 0.45, 0.45), (0.55, 1.45, floor + 0.225), -20), text, (0.15, 0.9)),
+            _surface(_box((0.6, 0.4, 1.1), (1.15, 2.4, floor + 0.55), 15), lines, (0.15, 0.9)),
+            _surface(_box((0.3, 0.3, 0.3), (0.0, 2.25, 0.1), 40, 20), plain, (0, 0.8)),
+            _surface(_box((0.4, 0.1, 0.5), (-1.35, 2.7, 0.45), 10), text, (0.15, 0.9)),
+            _surface(_box((0.5, 0.3, 0.25), (0.75, 2.6, 0.75), -30, 10), fine, (0.2, 0.9)),
+            _surface(_ball(0.25, (-0.05, 1.35, floor + 0.25)), lines, (0.2, 0.95)),
+            _surface(_ball(0.22, (0.5, 1.9, 0.3)), plain, (0, 0.35)),
+            _surface(_ball(0.3, (-0.75, 2.2, 0.35)), clouds, (0.2, 0.8)),
         ],
         camera=(0, 0, 0),
         target=(0, 2, -0.1),
@@ -76,37 +140,139 @@ def shapes(rng: np.random.Generator) -> Scene:
 def carpet(rng: np.random.Generator) -> Scene:
     """A plane of road-like lines, seen at a slant of 60 degrees from 1.5 metres away."""
     plane = _box((16, 16, 0.1), (0, 0, -0.05))
-    return _scene([(plane, textures.lines(rng), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
+    return build_scene([_surface(plane, textures.lines(rng), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
 
 
-SCENES = {"shapes": shapes, "carpet": carpet}
+def roads(rng: np.random.Generator) -> Scene:
+    """A plane with the map of a town, in colour, seen as `carpet` is."""
+    corners = 20 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    triangles = corners[[[0, 1, 2], [0, 2, 3]]]
+    uv = triangles[..., :2] * (1, -1) / textures.EXTENT
+    town = Surface(triangles, uv, np.ones((2, 3, 1)), textures.roads(rng))
+    return build_scene([town], camera=(0, -0.75, 1.3), target=(0, 0, 0))
 
 
-def _scene(
-    surfaces: list[tuple[trimesh.Trimesh, np.ndarray, tuple[float, float]]], camera: tuple, target: tuple
-) -> Scene:
-    """Meshes, each with its texture and the brightness of the texture's zeros and ones."""
-    meshes = [mesh for mesh, _, _ in surfaces]
-    return Scene(
-        np.concatenate([mesh.triangles for mesh in meshes]).astype(np.float32),
-        np.concatenate([_texture_coordinates(mesh) for mesh in meshes]).astype(np.float32),
-        np.concatenate([0.7 + 0.3 * np.maximum(mesh.vertex_normals[mesh.faces] @ LIGHT, 0) for mesh in meshes]).astype(
-            np.float32
-        ),
-        np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
-        np.stack([textures.mip_pyramid(dark + (bright - dark) * levels) for _, levels, (dark, bright) in surfaces]),
-        np.array(camera, float),
-        np.array(target, float),
+def moon(rng: np.random.Generator) -> Scene:
+    """A grey landscape of craters under a low sun, seen at a slant of 53 degrees from 1.9 metres away.
+
+    Its mesh is finest, 4 centimetres, at the target and reaches 20 metres; light and shadows are in its texture.
+    """
+    heights, brightness = textures.moon(rng)
+    smooth = gaussian_filter(heights, 8, mode="wrap")
+    steps = np.linspace(-1, 1, 201)
+    x, y = np.meshgrid(*2 * [20 * np.sinh(3.5 * steps) / np.sinh(3.5)])
+    uv = np.stack([x, -y], -1) / textures.MOON_EXTENT
+    z = map_coordinates(smooth, uv.transpose(2, 0, 1)[::-1] * len(smooth) - 0.5, order=1, mode="grid-wrap")
+    corner = np.arange(x.size).reshape(x.shape)
+    near, far = (corner[:-1, :-1], corner[:-1, 1:]), (corner[1:, :-1], corner[1:, 1:])
+    faces = np.concatenate([np.stack([*near, far[1]], -1), np.stack([near[0], far[1], far[0]], -1)]).reshape(-1, 3)
+    ground = Surface(
+        np.stack([x, y, z], -1).reshape(-1, 3)[faces],
+        uv.reshape(-1, 2)[faces],
+        np.ones((len(faces), 3, 1)),
+        brightness[..., None],
+    )
+    return build_scene([ground], camera=(0, -1.15, 1.5), target=(0, 0, 0))
+
+
+def board(rng: np.random.Generator) -> Scene:
+    """A desk in a room, with a board 1.3 metres away on which text is printed in many sizes, some of it small."""
+    bricks, wood, clouds, plain = textures.bricks(rng), textures.wood(rng), textures.clouds(rng), textures.plain()
+    lines, text, mosaic = textures.lines(rng), textures.text(rng), textures.mosaic(rng)
+    desk = -0.47
+    tilt = rotation_matrix(np.radians(-8), [1, 0, 0], (0, 1.2, desk))
+
+    def on_desk(size: tuple, x: float, y: float, turn: float = 0, above: float = 0) -> trimesh.Trimesh:
+        return _box(size, (x, y, desk + above + size[2] / 2), turn)
+
+    slab = _box((1.28, 0.03, 0.98), (0, 1.22, desk + 0.49))
+    slab.apply_transform(tilt)
+    left, right, top, bottom = -0.6, 0.6, desk + 0.94, desk + 0.04
+    corners = transform_points([[left, 1.2, top], [right, 1.2, top], [right, 1.2, bottom], [left, 1.2, bottom]], tilt)
+    halves = [[0, 1, 2], [0, 2, 3]]
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    page = Surface(corners[halves], square[halves], np.full((2, 3, 1), 0.9), 0.06 + 0.9 * textures.page(rng)[..., None])
+    mug = trimesh.creation.cylinder(0.05, 0.12)
+    mug.apply_translation((0.5, 0.9, desk + 0.06))
+    return build_scene(
+        [
+            *_room((-2.4, -1.5, -1.2), (2.4, 2.3, 1.6), bricks, clouds, plain, mosaic),
+            page,
+            _surface(slab, wood, (0, 0.4)),
+            _surface(on_desk((2.6, 1.0, 0.04), 0, 1.2, above=-0.04), wood, (0.1, 0.75)),
+            _surface(on_desk((0.3, 0.22, 0.05), -0.66, 0.92, 12), text, (0.1, 0.7)),
+            _surface(on_desk((0.26, 0.2, 0.04), -0.66, 0.92, -6, 0.05), mosaic, (0.2, 0.8)),
+            _surface(on_desk((0.24, 0.18, 0.06), -0.65, 0.93, 25, 0.09), lines, (0.15, 0.9)),
+            _surface(on_desk((0.4, 0.16, 0.02), -0.1, 0.88, 4), mosaic, (0.1, 0.8)),
+            _surface(on_desk((0.18, 0.012, 0.012), 0.3, 0.85, 30), plain, (0, 0.85)),
+            _surface(on_desk((0.16, 0.012, 0.012), 0.27, 0.92, -15), plain, (0, 0.1)),
+            _surface(mug, plain, (0, 0.75)),
+            _surface(_ball(0.09, (0.72, 1.05, desk + 0.09)), mosaic, (0.15, 0.95)),
+        ],
+        camera=(0, -0.1, 0),
+        target=(0, 1.2, -0.08),
     )
 
 
-def _texture_coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Along the two world axes that a face lies closest to, so that it is upright and not mirrored from outside."""
-    across = np.abs(mesh.face_normals).argmax(1)
+SCENES = {"shapes": shapes, "carpet": carpet, "roads": roads, "moon": moon, "board": board}
+
+
+def diffuse_light(
+    normals: Float[np.ndarray, "faces 3 3"], light: Float[np.ndarray, "3"] = LIGHT
+) -> Float[np.ndarray, "faces 3 1"]:
+    """What falls on corners with these unit normals: 0.7 from everywhere, and up to 0.3 from a light far away.
+
+    Args:
+        light: unit vector towards it.
+    """
+    return 0.7 + 0.3 * np.maximum(normals @ light, 0)[..., None]
+
+
+def corner_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 3"]:
+    """Unit normals at the corners of all faces: of the smoothed surface, at edges above 40 degrees of the face."""
+    smooth, flat = mesh.vertex_normals[mesh.faces], mesh.face_normals[:, None]
+    return np.where((smooth * flat).sum(-1, keepdims=True) > np.cos(np.radians(40)), smooth, flat)
+
+
+def texture_coordinates(
+    triangles: Float[np.ndarray, "faces 3 3"], face_normals: Float[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 2"]:
+    """To the right and downwards, in the unit of the corners, along the two axes that a face lies closest to: a texture
+    is upright and not mirrored from outside."""
+    across = np.abs(face_normals).argmax(1)
     faces = np.arange(len(across))
-    outwards = np.sign(mesh.face_normals[faces, across]) * np.array([1, -1, 1])[across]
+    outwards = np.sign(face_normals[faces, across]) * np.array([1, -1, 1])[across]
     to_right, up = np.array([1, 0, 0])[across], np.array([2, 2, 1])[across]
-    return np.stack([outwards[:, None] * mesh.triangles[faces, :, to_right], -mesh.triangles[faces, :, up]], axis=-1)
+    return np.stack([outwards[:, None] * triangles[faces, :, to_right], -triangles[faces, :, up]], axis=-1)
+
+
+def _surface(mesh: trimesh.Trimesh, levels: np.ndarray, brightness: tuple[float, float]) -> Surface:
+    """A mesh in a procedural texture [size, size] whose zeros and ones get the given brightness."""
+    dark, bright = brightness
+    uv = texture_coordinates(mesh.triangles, mesh.face_normals) / textures.EXTENT
+    image = (dark + (bright - dark) * levels)[..., None]
+    return Surface(mesh.triangles, uv, diffuse_light(corner_normals(mesh)), image)
+
+
+def _room(
+    lower: tuple, upper: tuple, back: np.ndarray, floor: np.ndarray, plain: np.ndarray, right: np.ndarray
+) -> list[Surface]:
+    """The inner sides of a box between two corners, in textures."""
+    room = trimesh.creation.box(bounds=[lower, upper])
+    room.invert()
+    room.unmerge_vertices()
+
+    def wall(*normal: int) -> trimesh.Trimesh:
+        return trimesh.Trimesh(room.vertices, room.faces[room.face_normals @ normal > 0.5], process=False)
+
+    return [
+        _surface(wall(0, -1, 0), back, (0.3, 0.6)),
+        _surface(wall(0, 0, 1), floor, (0.35, 0.65)),
+        _surface(wall(1, 0, 0), plain, (0, 0.5)),
+        _surface(wall(-1, 0, 0), right, (0.3, 0.6)),
+        _surface(wall(0, 0, -1), plain, (0, 0.8)),
+        _surface(wall(0, 1, 0), plain, (0, 0.5)),
+    ]
 
 
 def _box(size: tuple, centre: tuple, turn: float = 0, tilt: float = 0) -> trimesh.Trimesh:

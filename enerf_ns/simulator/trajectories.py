@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from jaxtyping import Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.recording import RecordingError, read_recording
+from enerf_ns.dataparsers.text_tables import FARTHEST, parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 POSES_PER_SECOND = 1000
+
+SHORTEST, LONGEST = 10**6, 10**12
+"""Nanoseconds that a trajectory from a file may last; others' times are in another unit than was thought."""
+
+SMALLEST_DISTANCE = 1e-3
+"""Metres between a camera and its target."""
+
+STEEPEST_LOOK = 0.01
+"""Angle to the vertical, radians, below which upright has no meaning."""
 
 
 def shake(
@@ -52,20 +66,102 @@ def spiral(
     radius = 0.5 - 0.4 * done
     offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(len(times))], axis=1)
     positions = camera + look_at(camera, target).apply(offsets)
-    rotations = Rotation.concatenate([look_at(position, target) for position in positions])
-    return Trajectory(times, positions, rotations.as_quat())
+    return Trajectory(times, positions, look_at(positions, target).as_quat())
 
 
 MOTIONS = {"shake": shake, "spiral": spiral}
 
 
-def look_at(camera: np.ndarray, target: np.ndarray) -> Rotation:
-    """Rotation, camera to world, of an upright camera that sees the target in its centre; z is up in the world."""
-    forward = (target - camera) / np.linalg.norm(target - camera)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    return Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=1))
+def key_frames(path: Path) -> Trajectory:
+    """A camera that passes upright through the places of a text file, looking at a target that moves as smoothly.
+
+    The file has a key frame a line, `t_s x y z tx ty tz`: seconds, the place of the camera and that of its target in
+    metres, z up. Between key frames both are interpolated by PCHIP (Fritsch and Butland, 1984), which never leaves the
+    range of its neighbours. The trajectory begins at time 0.
+
+    Raises:
+        RecordingError: The file is missing, no such table, has fewer than two rows, a place beyond 1e9 m, or times that
+            do not increase or last less than a millisecond or more than 1000 seconds; or the camera reaches its target
+            or looks straight up or down.
+    """
+    columns = "t_s x y z tx ty tz"
+    rows, numbers = read_rows(path, columns)
+    if len(rows) < 2:
+        raise RecordingError(f"{path} holds one key frame, but at least 2 were expected, with the columns {columns}.")
+    keys = _from_zero(path, parse_times(path, [row[0] for row in rows], numbers, "s"), "must be in seconds")
+    places = parse_numbers(path, [row[1:] for row in rows], numbers)
+    if (far := np.abs(places).max(1) > FARTHEST).any():
+        raise RecordingError(
+            f"{path}, line {numbers[np.argmax(far)]} holds a place beyond {FARTHEST:g} m, where none was expected."
+        )
+    counts = np.maximum(1, np.diff(keys) * POSES_PER_SECOND // 10**9)
+    steps = [np.linspace(keys[i], keys[i + 1], count, endpoint=False) for i, count in enumerate(counts)]
+    times = np.append(np.concatenate(steps), keys[-1]).astype(np.int64)
+    cameras, targets = np.hsplit(PchipInterpolator(keys, places)(times), 2)
+    _check_looks(path, times, targets - cameras)
+    return Trajectory(times, cameras, look_at(cameras, targets).as_quat())
+
+
+def from_file(path: Path, notes: list[str], unit: str = "s") -> Trajectory:
+    """The trajectory of a recording's event camera, or that of a pose file, begun at time 0.
+
+    Args:
+        path: Folder of a recording in any format that `read_recording` knows, or a text file with a pose a line,
+            `t px py pz qx qy qz qw`: camera to world, OpenCV axes, metres.
+        notes: Gets a sentence if quaternions of a pose file had to be renormalised.
+        unit: Of the times of a pose file, "s", "us" or "ns".
+
+    Raises:
+        RecordingError: The folder is no recording, or the file is no table of poses (see `read_poses`) or lasts less
+            than a millisecond or more than 1000 seconds.
+    """
+    if path.is_dir():
+        trajectory = read_recording(path).trajectory
+        return Trajectory(trajectory.times - trajectory.start, trajectory.positions, trajectory.quaternions)
+    times, positions, quaternions = read_poses(path, unit, notes)
+    return Trajectory(_from_zero(path, times, f"were taken to be in {unit}"), positions, quaternions)
+
+
+def look_at(camera: Float64[np.ndarray, "*batch 3"], target: Float64[np.ndarray, "*batch 3"]) -> Rotation:
+    """Rotations, camera to world, of upright cameras that see a target in their centre; z is up in the world."""
+    forward = _normalised(target - camera)
+    right = _normalised(np.cross(forward, [0, 0, 1]))
+    return Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=-1))
+
+
+def _normalised(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _pose_times(duration: int) -> np.ndarray:
     return np.linspace(0, duration, max(200, round(duration * 1e-9 * POSES_PER_SECOND)) + 1).astype(np.int64)
+
+
+def _from_zero(path: Path, times: np.ndarray, unit: str) -> np.ndarray:
+    if not SHORTEST <= times[-1] - times[0] <= LONGEST:
+        raise RecordingError(
+            f"{path} lasts {(times[-1] - times[0]) * 1e-9:.6g} s, but between a millisecond and 1000 seconds were "
+            f"expected; its times {unit}."
+        )
+    return times - times[0]
+
+
+def _check_looks(path: Path, times: np.ndarray, looks: np.ndarray) -> None:
+    """Whether a camera is upright somewhere and always away from its target, between the poses [N, 3] too."""
+    near = _closest(looks) < SMALLEST_DISTANCE
+    steep = _closest(looks[:, :2]) < STEEPEST_LOOK * np.linalg.norm(looks[1:], axis=1)
+    for wrong, what, advice in (
+        (near, "is at its target", "move one of them"),
+        (steep, "looks straight up or down, where no side of the picture is the upper one", "look past the vertical"),
+    ):
+        if wrong.any():
+            time = times[:-1][wrong][0] * 1e-9
+            raise RecordingError(f"{path}: {time:.3f} s after its beginning the camera {what}; {advice}.")
+
+
+def _closest(points: np.ndarray) -> np.ndarray:
+    """How near the line from each point [N, D] to the next comes to the origin, [N - 1]."""
+    first, step = points[:-1], np.diff(points, axis=0)
+    square = (step**2).sum(1)
+    passed = np.divide(-(first * step).sum(1), square, out=np.zeros(len(step)), where=square > 0).clip(0, 1)
+    return np.linalg.norm(first + passed[:, None] * step, axis=1)

@@ -1,0 +1,156 @@
+"""Frames of a simulated camera: sharp and blurred by motion, and the 8 bits that its sensor makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt8
+
+from enerf_ns.dataparsers.recording import RecordingError
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """The sensor of the frames. Its noise is drawn anew for each frame, and the same for one seed.
+
+    Raises:
+        RecordingError: A setting is out of its range.
+    """
+
+    saturation: float = 1.0
+    """Brightness, above 0, from which on pixels are white."""
+    read_noise: float = 0.0
+    """Standard deviation in grey levels, of which there are 255."""
+    shot_noise: float = 0.0
+    """Electrons in a pixel that is white, its full well: the fewer, the more noise; 0 for no noise."""
+    hdr: bool = False
+    """Keep the linear brightness of frames as well, without noise and saturation."""
+    seed: int = 0
+    """Draws the noise; from 0 on."""
+
+    def __post_init__(self) -> None:
+        for name, fine, expected in (
+            ("saturation", 0 < self.saturation < np.inf, "a brightness above 0"),
+            ("read noise", 0 <= self.read_noise < np.inf, "grey levels from 0 on"),
+            ("shot noise", 0 <= self.shot_noise < np.inf, "electrons from 0 on"),
+            ("seed", self.seed >= 0, "a whole number from 0 on"),
+        ):
+            if not fine:
+                value = getattr(self, name.replace(" ", "_"))
+                raise RecordingError(f"The {name} of frames is {value:g}, but {expected} was expected.")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What falls on the sensor: linear brightness, in colour R G B."""
+
+    number: int
+    """From 0."""
+    time: int
+    """ns, the middle of the exposure."""
+    sharp: Float[np.ndarray, "height width *channels"]
+    """At that time."""
+    blurred: Float[np.ndarray, "height width *channels"] | None
+    """The mean over the exposure; None if that is 0."""
+
+
+class Exposures:
+    """Frames from pictures at the times of their exposures.
+
+    Brightness is taken to change linearly from one picture to the next, as between events, so that the integral over
+    the exposure is a sum of trapezoids.
+
+    Args:
+        times: Of the frames (ns), increasing: the middles of their exposures.
+        exposure: How long each lasts (ns); 0 for sharp frames alone.
+
+    Raises:
+        RecordingError: The exposure is negative, or longer than from one frame to the next.
+    """
+
+    def __init__(self, times: Int64[np.ndarray, " frames"], exposure: int):
+        self.times, self.exposure = times, exposure
+        self.opens = times - exposure // 2
+        self.closes = self.opens + exposure
+        interval = int(np.diff(times).min(initial=np.iinfo(np.int64).max))
+        if not 0 <= exposure <= interval:
+            raise RecordingError(
+                f"The exposure of {exposure * 1e-6:g} ms does not fit frames {interval * 1e-6:g} ms apart; give one "
+                "from 0 ms up to the time from frame to frame, or fewer frames."
+            )
+        self._number = 0
+        self._last: tuple[int, np.ndarray] | None = None
+        self._begin()
+
+    @property
+    def stops(self) -> Int64[np.ndarray, " stops"]:
+        """Times (ns, increasing) at which there must be pictures: exposures begin, are half over, and end."""
+        return np.unique(np.concatenate([self.opens, self.times, self.closes]))
+
+    def add(self, time: int, brightness: Float[np.ndarray, "height width *channels"]) -> Frame | None:
+        """Takes the next picture; outside exposures there need be none.
+
+        Args:
+            time: ns, later than that of the picture before.
+            brightness: Linear, from 0 on; not changed afterwards.
+
+        Returns:
+            the frame whose exposure ends now, if one does.
+
+        Raises:
+            ValueError: There was no picture when its exposure began or was half over, or there is none at its end.
+        """
+        number = self._number
+        if number == len(self.times):
+            return None
+        if self._last is not None and self._last[0] >= self.opens[number]:
+            last_time, last = self._last
+            if self._sum is None:
+                self._sum = np.zeros(last.shape)
+            self._sum += (last + brightness) * (0.5 * (time - last_time))
+            self._exposed += time - last_time
+        self._last = time, brightness
+        if time == self.times[number]:
+            self._sharp = brightness
+        if time < self.closes[number]:
+            return None
+        if time > self.closes[number] or self._exposed != self.exposure or self._sharp is None:
+            raise ValueError(
+                f"Frame {number} needs pictures at {self.opens[number]}, {self.times[number]} and "
+                f"{self.closes[number]} ns."
+            )
+        blurred = None if self._sum is None else self._sum / self.exposure
+        frame = Frame(number, int(self.times[number]), self._sharp, blurred)
+        self._number += 1
+        self._begin()
+        return frame
+
+    def _begin(self) -> None:
+        self._sum: np.ndarray | None = None
+        self._exposed = 0
+        self._sharp: np.ndarray | None = None
+
+
+def develop(
+    brightness: Float[np.ndarray, "height width *channels"], settings: FrameSettings, number: int, blurred: bool
+) -> UInt8[np.ndarray, "height width *channels"]:
+    """The grey levels that the sensor reads out: 255 from the saturation on, rounded to the nearest.
+
+    The electrons in a pixel are Poisson distributed about its share of the full well, and reading them out adds a
+    Gaussian error to the level.
+
+    Args:
+        brightness: Linear, from 0 on.
+        settings: Of the sensor.
+        number: Of the frame, from 0, which draws the noise together with the seed and `blurred`.
+        blurred: Whether it is the blurred or the sharp frame of this number.
+    """
+    rng = np.random.default_rng([settings.seed, number, int(blurred)])
+    level = np.asarray(brightness, np.float64) / settings.saturation
+    if settings.shot_noise:
+        level = rng.poisson(level * settings.shot_noise) / settings.shot_noise
+    grey = 255 * level
+    if settings.read_noise:
+        grey += rng.normal(0, settings.read_noise, grey.shape)
+    return np.rint(grey).clip(0, 255).astype(np.uint8)

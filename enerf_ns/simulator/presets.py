@@ -1,0 +1,62 @@
+"""The five simulated sequences of the E-NeRF paper (Klenk et al., RA-L 2023), made again: `enerf simulate spiral1`.
+
+Scene, motion, kind of blur, size and number of frames are the paper's; what it does not tell, such as speed, exposure
+and field of view, is chosen here, so that the presets of `ns-train` with these names fit what is simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.simulator.trajectories import shake, spiral
+
+
+@dataclass(frozen=True)
+class SimulationPreset:
+    """How one sequence is simulated."""
+
+    scene: Literal["roads", "moon"]
+    """A name of `scenes.SCENES`."""
+    motion: Literal["shake", "spiral"]
+    """Forward-facing with abrupt turns, or inward."""
+    turns_per_second: float
+    """How often a shaking camera turns back, or how often a camera goes round its target."""
+    num_frames: int
+    """As many as the paper's configs select from."""
+    duration: float
+    """Seconds."""
+    exposure_ms: float
+    """Of the blurred frames, milliseconds."""
+    blur: float
+    """How far the picture moves during an exposure: pixels, mean over the picture, the frames and many seeds."""
+    width: int = 640
+    """Pixels."""
+    height: int = 480
+    """Pixels."""
+    field_of_view: float = 60.0
+    """Horizontal, degrees."""
+    contrast_thresholds: tuple[float, float] = (0.2, 0.2)
+    """Those that the paper learns with, of on and of off events."""
+
+    def trajectory(self, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> Trajectory:
+        """The motion of this preset before a scene; arguments as of `trajectories.shake`."""
+        duration = round(self.duration * 1e9)
+        if self.motion == "shake":
+            return shake(duration, camera, target, rng, self.turns_per_second)
+        return spiral(duration, camera, target, rng, self.turns_per_second * self.duration)
+
+
+PRESETS = {
+    "spiral1": SimulationPreset("roads", "spiral", 1.2, num_frames=66, duration=1.65, exposure_ms=10.0, blur=4.5),
+    "spiral2": SimulationPreset("roads", "spiral", 1.2, num_frames=48, duration=1.2, exposure_ms=10.0, blur=4.5),
+    "shake-moon1": SimulationPreset("moon", "shake", 3.0, num_frames=65, duration=1.625, exposure_ms=10.0, blur=4.3),
+    "shake-moon2": SimulationPreset("moon", "shake", 4.0, num_frames=77, duration=1.925, exposure_ms=16.0, blur=9.2),
+    "shake-carpet1": SimulationPreset(
+        "roads", "shake", 6.0, num_frames=41, duration=1.025, exposure_ms=22.0, blur=20.0
+    ),
+}
+"""Mild blur (spiral1, spiral2, shake-moon1), medium (shake-moon2) and strong (shake-carpet1)."""

@@ -1,0 +1,385 @@
+"""What the simulated camera can look at: anything that has a linear brightness at any time."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64, Shaped, UInt8
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.recording import EventRecording, RecordingError, image_size, load_image
+from enerf_ns.dataparsers.text_tables import read_times
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from enerf_ns.simulator.render import Renderer
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+
+FRAMES_KEPT = 8
+"""Of a video, for threads that ask for its frames not quite in order."""
+
+SHARE_DECODED = 0.9
+"""Of the frames that a video states to have, which not all count exactly; with fewer, its end is missing."""
+
+OPENGL_AXES = np.array([1.0, -1.0, -1.0, 1.0])
+"""Turns the columns of a pose [R | t] from x right, y down, z forward to x right, y up, z back, and back again."""
+
+
+class Source(Protocol):
+    """A picture at any time."""
+
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    start: int
+    """First time at which it can be seen, ns."""
+    end: int
+    """Last time at which it can be seen, ns."""
+
+    def brightness(self, time: int) -> Float[np.ndarray, "height width *channels"]:
+        """Linear brightness, 0 or more, grey [height, width] or R G B [height, width, 3].
+
+        May be called from several threads at once.
+
+        Args:
+            time: ns, from `start` to `end`.
+        """
+        ...
+
+
+class RenderedScene:
+    """A scene as the camera of a renderer sees it, moving along a trajectory."""
+
+    def __init__(self, renderer: Renderer, trajectory: Trajectory):
+        self.renderer, self.trajectory = renderer, trajectory
+        self.width, self.height = renderer.width, renderer.height
+        self.start, self.end = trajectory.start, trajectory.end
+
+    def brightness(self, time: int) -> Float[np.ndarray, "height width *channels"]:
+        """As of `Source`."""
+        return self.renderer.brightness(_pose(self.trajectory, time))
+
+    def depth(self, time: int) -> Float32[np.ndarray, "height width"]:
+        """z-depth in metres, 0 where nothing is hit."""
+        return self.renderer.depth(_pose(self.trajectory, time))
+
+
+class Pictures(ABC):
+    """Pictures at some times, between which log brightness is linear.
+
+    Args:
+        path: Where they are.
+        times: ns, strictly increasing from 0, of at least two pictures.
+        gamma: Whether their values are sRGB, else linear.
+        log_eps: What the sensor adds to the brightness before its logarithm is taken.
+    """
+
+    width: int
+    height: int
+
+    def __init__(self, path: Path, times: Int64[np.ndarray, " pictures"], gamma: bool, log_eps: float):
+        self.path, self.times, self.gamma, self.log_eps = path, times, gamma, log_eps
+        self.start, self.end = 0, int(times[-1])
+        self._linear = lru_cache(maxsize=4)(self._load_linear)
+
+    @abstractmethod
+    def _load(self, index: int) -> Shaped[np.ndarray, "height width *channels"]:
+        """One picture as it is stored, uint8 or uint16, grey or R G B."""
+
+    def brightness(self, time: int) -> Float32[np.ndarray, "height width *channels"]:
+        """As of `Source`.
+
+        Raises:
+            RecordingError: The picture before or after this time cannot be read, or is of another kind than the first.
+        """
+        if not self.start <= time <= self.end:
+            raise ValueError(f"{self.path} was asked for {time} ns, but lasts from {self.start} to {self.end} ns.")
+        before = int(np.searchsorted(self.times, time, side="right")) - 1
+        if time == self.times[before]:
+            return self._linear(before).copy()
+        first, second = (np.log(self.log_eps + self._linear(index)) for index in (before, before + 1))
+        passed = (time - self.times[before]) / (self.times[before + 1] - self.times[before])
+        return np.maximum(np.exp(first + np.float32(passed) * (second - first)) - np.float32(self.log_eps), 0)
+
+    def _load_linear(self, index: int) -> np.ndarray:
+        picture = self._load(index)
+        levels = np.linspace(0, 1, np.iinfo(picture.dtype).max + 1)
+        return (linear_from_srgb(levels) if self.gamma else levels).astype(np.float32)[picture]
+
+
+class ImageFolder(Pictures):
+    """The pictures of a folder, of 8 or 16 bits, in the order of their names, in which numbers count as numbers.
+
+    Args:
+        path: The folder.
+        frames_per_second: How close the pictures are, unless their times are given.
+        stamps: Text file with the time of each picture, a line each; the first one becomes time 0.
+        unit: Of these times, "s", "us" or "ns".
+        gamma: As of `Pictures`.
+        log_eps: As of `Pictures`.
+
+    Raises:
+        RecordingError: No folder, fewer than two pictures, pictures of several sizes, a first one that cannot be read,
+            neither times nor a frame rate or both, or not one time a picture.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        frames_per_second: float | None = None,
+        stamps: Path | None = None,
+        unit: str = "s",
+        gamma: bool = True,
+        log_eps: float = 0.001,
+    ):
+        if not path.is_dir():
+            raise RecordingError(f"{path} is no folder, but one with pictures was expected.")
+        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
+        self.filenames = sorted(files, key=_by_number)
+        if len(files) < 2:
+            found = "only one picture" if files else "no pictures"
+            raise RecordingError(f"{path} holds {found} ({' '.join(PICTURE_SUFFIXES)}), but at least two are needed.")
+        if frames_per_second is not None and stamps is None:
+            times = _regular_times(path, len(files), frames_per_second)
+        elif stamps is not None and frames_per_second is None:
+            times = read_times(stamps, unit)
+            if len(times) != len(files):
+                raise RecordingError(
+                    f"{stamps} holds {len(times):,} times, but {path} {len(files):,} pictures; give one time a picture."
+                )
+        else:
+            raise RecordingError(f"{path} needs either --fps or --stamps, the times of its pictures.")
+        super().__init__(path, times - times[0], gamma, log_eps)
+        self.width, self.height = image_size(self.filenames[0])
+        for file in self.filenames:
+            if (size := image_size(file)) != (self.width, self.height):
+                raise RecordingError(
+                    f"{file} has {size[0]} x {size[1]} pixels, but the first picture, {self.filenames[0].name}, has "
+                    f"{self.width} x {self.height}; give pictures of one size."
+                )
+        first = self._decode(self.filenames[0])
+        self._kind = first.ndim, first.dtype
+
+    def _load(self, index: int) -> Shaped[np.ndarray, "height width *channels"]:
+        picture = self._decode(self.filenames[index])
+        if (picture.ndim, picture.dtype) != self._kind:
+            found, expected = (
+                f"{'grey' if ndim == 2 else 'in colour'} with {8 * dtype.itemsize} bits"
+                for ndim, dtype in ((picture.ndim, picture.dtype), self._kind)
+            )
+            raise RecordingError(
+                f"{self.filenames[index]} is {found}, but the first picture, {self.filenames[0].name}, is {expected}; "
+                "give pictures of one kind."
+            )
+        return picture
+
+    def _decode(self, file: Path) -> np.ndarray:
+        picture = load_image(file)  # which says what is wrong with a file, but gives 8 bits
+        stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if stored is not None and stored.dtype == np.uint16:
+            picture = np.atleast_3d(stored)
+            if picture.shape[2] == 4:
+                opacity = picture[..., 3:] / 65535
+                picture = np.round(picture[..., :3] * opacity + 65535 * (1 - opacity)).astype(np.uint16)
+            picture = picture[..., ::-1]
+        elif stored is not None and stored.dtype != np.uint8:
+            raise RecordingError(f"{file} holds values of {stored.dtype}, but pictures of 8 or 16 bits were expected.")
+        return picture[..., 0] if picture.shape[2] == 1 else picture
+
+
+class Video(Pictures):
+    """The frames of a video, in colour, decoded one after the other; a step back by more than a few starts again.
+
+    Args:
+        path: The file, in any format that OpenCV decodes.
+        frames_per_second: How fast the frames were recorded; None: as fast as they are played.
+        gamma: As of `Pictures`.
+        log_eps: As of `Pictures`.
+
+    Raises:
+        RecordingError: No file, no video, fewer than two frames, no frame rate, or an end that is missing.
+    """
+
+    def __init__(self, path: Path, frames_per_second: float | None = None, gamma: bool = True, log_eps: float = 0.001):
+        if not path.is_file():
+            raise RecordingError(f"{path} is no file, but a video was expected.")
+        self.path, self._lock = path, Lock()
+        self._open()
+        rate = self._capture.get(cv2.CAP_PROP_FPS) if frames_per_second is None else frames_per_second
+        stated = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        count = 0
+        while self._capture.grab():
+            count += 1
+        if count < 2 or count < SHARE_DECODED * stated:
+            raise RecordingError(
+                f"{path} should hold {max(2, stated):,} frames{' or more' * (stated < 2)}, but only {count:,} can be "
+                "decoded; copy it again from its source."
+            )
+        super().__init__(path, _regular_times(path, count, rate), gamma, log_eps)
+        self._open()
+
+    def _open(self) -> None:
+        self._capture = cv2.VideoCapture(str(self.path))
+        if not self._capture.isOpened():
+            raise RecordingError(f"{self.path} cannot be decoded as a video; give one in a format that OpenCV reads.")
+        self._next = 0
+        self._recent: dict[int, np.ndarray] = {}
+
+    def _load(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        with self._lock:
+            if index < self._next and index not in self._recent:
+                self._open()
+            while self._next <= index:
+                decoded, frame = self._capture.read()
+                if not decoded or frame.shape != (self.height, self.width, 3):
+                    raise RecordingError(f"{self.path}, frame {self._next} cannot be decoded; copy it again.")
+                self._recent[self._next] = frame
+                self._recent.pop(self._next - FRAMES_KEPT, None)
+                self._next += 1
+            return self._recent[index][..., ::-1]
+
+
+class TrainedRun:
+    """A radiance field that Nerfstudio trained, as a pinhole camera sees it, moving along a trajectory.
+
+    Of a run of this package, what it renders is linear brightness; of any other method, it is taken for sRGB.
+
+    Args:
+        config: config.yml of the run.
+        trajectory: In the world and the unit (for recordings, metres) of the run's data, OpenCV axes. None: that of the
+            run's recording, begun at time 0; of another method, past the cameras it was trained on, one after the other
+            in equal times.
+        duration: Of the way past these cameras, ns.
+        camera: Without distortion. None: the event camera without its distortion, or the first camera of the training.
+
+    Raises:
+        RecordingError: No such file, anything that Nerfstudio cannot load, or fewer than two cameras to move past.
+    """
+
+    def __init__(
+        self, config: Path, trajectory: Trajectory | None = None, duration: int = 10**9, camera: Camera | None = None
+    ):
+        pipeline = _load_run(config)
+        from nerfstudio.models.splatfacto import SplatfactoModel
+
+        self.config = config
+        self._model, self._lock = pipeline.model, Lock()
+        self._renders_z_depth = isinstance(self._model, SplatfactoModel)
+        outputs = pipeline.datamanager.train_dataparser_outputs
+        self._transform = outputs.dataparser_transform[:3].double().numpy()
+        self._scale = float(outputs.dataparser_scale)
+        recording = outputs.metadata.get("recording")
+        self._is_linear = isinstance(recording, EventRecording)
+        if isinstance(recording, EventRecording):
+            own = recording.trajectory
+            self.camera = camera or recording.camera.undistorted()
+            self.trajectory = trajectory or Trajectory(own.times - own.start, own.positions, own.quaternions)
+        else:
+            self.camera = camera or _camera(outputs.cameras[0])
+            self.trajectory = trajectory or self._past(outputs.cameras, duration)
+        self.width, self.height = self.camera.width, self.camera.height
+        self.start, self.end = self.trajectory.start, self.trajectory.end
+
+    def brightness(self, time: int) -> Float32[np.ndarray, "height width *channels"]:
+        """As of `Source`; grey where the field is."""
+        rgb = self._render(time, "rgb")
+        if not self._is_linear:
+            return linear_from_srgb(rgb.clip(0, 1)).astype(np.float32)
+        return rgb[..., 0] if self._model.config.num_channels == 1 else rgb
+
+    def depth(self, time: int) -> Float32[np.ndarray, "height width"]:
+        """z-depth in the unit of the trajectory."""
+        depth = self._render(time, "depth")[..., 0] / self._scale
+        if not self._renders_z_depth:
+            depth /= np.linalg.norm(self.camera.pixel_directions(), axis=-1)
+        return depth.astype(np.float32)
+
+    @torch.no_grad()
+    def _render(self, time: int, output: str) -> np.ndarray:
+        from nerfstudio.cameras.cameras import Cameras
+
+        rotation, shift = self._transform[:, :3], self._transform[:, 3]
+        pose = rotation @ _pose(self.trajectory, time)
+        pose[:, 3] = self._scale * (pose[:, 3] + shift)
+        camera = Cameras(
+            torch.from_numpy(pose * OPENGL_AXES).float()[None],
+            fx=self.camera.fx,
+            fy=self.camera.fy,
+            cx=self.camera.cx + 0.5,
+            cy=self.camera.cy + 0.5,
+            width=self.camera.width,
+            height=self.camera.height,
+        )
+        with self._lock:
+            outputs = self._model.get_outputs_for_camera(camera.to(self._model.device))
+        if output not in outputs:
+            raise RecordingError(f"{self.config} is a run of a method that renders no {output}; give one that does.")
+        return outputs[output].float().cpu().numpy()
+
+    def _past(self, cameras: Any, duration: int) -> Trajectory:
+        """Through cameras of the training, in the world of the run's data."""
+        if len(cameras) < 2:
+            raise RecordingError(f"{self.config} was trained on one camera; give a --trajectory to render it along.")
+        poses = cameras.camera_to_worlds.double().cpu().numpy() * OPENGL_AXES
+        back = np.linalg.inv(self._transform[:, :3])
+        positions = (poses[:, :, 3] / self._scale - self._transform[:, 3]) @ back.T
+        times = np.linspace(0, duration, len(poses)).astype(np.int64)
+        return Trajectory(times, positions, Rotation.from_matrix(back @ poses[:, :, :3]).as_quat())
+
+
+def linear_from_srgb(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Linear brightness in [0, 1] of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def _pose(trajectory: Trajectory, time: int) -> np.ndarray:
+    return trajectory.poses(torch.tensor(time)).numpy()
+
+
+def _regular_times(path: Path, count: int, rate: float) -> np.ndarray:
+    if not 0 < rate < 1e9:
+        raise RecordingError(f"{path} has {rate:g} frames per second, which is no frame rate; give it with --fps.")
+    return np.round(np.arange(count) * (1e9 / rate)).astype(np.int64)
+
+
+def _by_number(file: Path) -> tuple[list, str]:
+    """For sorting names so that picture10 comes after picture9."""
+    parts = re.split(r"([0-9]+)", file.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], file.name
+
+
+def _camera(camera: Any) -> Camera:
+    """Of a camera of Nerfstudio, without its distortion."""
+    fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
+    return Camera(int(camera.width), int(camera.height), fx, fy, cx - 0.5, cy - 0.5)
+
+
+def _load_run(config: Path) -> Any:
+    """Nerfstudio's pipeline of a trained run."""
+    if not config.is_file():
+        raise RecordingError(f"{config} does not exist; give the config.yml of a trained run.")
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    try:
+        return eval_setup(config, test_mode="inference")[1]
+    except (Exception, SystemExit) as error:  # whatever of a run is missing or of another version
+        reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
+        if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):
+            reason = "its checkpoints are not found"  # the folder is empty or missing, which Nerfstudio only prints
+        raise RecordingError(
+            f"{config} cannot be loaded as a trained run ({reason}); give the config.yml that training wrote, in the "
+            "folder in which training was started."
+        ) from error
