@@ -328,3 +328,18 @@ def test_a_video_of_pictures_makes_events(tmp_path):
     change = math.log((200 / 255 + 0.001) / (40 / 255 + 0.001))
     x, p = (np.load(tmp_path / f"own/events/{name}.npy") for name in "xp")
     assert len(x) == 12 * 16 * math.floor(change / 0.25) and (p > 0).all()
+
+
+@pytest.mark.slow
+def test_twice_as_many_renders_make_the_same_events_but_for_a_few(tmp_path):
+    """Both rebuild the same brightness, so that a pixel's net count differs by one at most; extrema between renders
+    cost the coarser one some pairs of an on and an off event."""
+    counts, net = [], []
+    for name, displacement in (("coarse", 0.5), ("fine", 0.25)):
+        Simulate(tmp_path / name, "shapes", max_displacement=displacement, **SHORT).main()
+        x, y, _, p = np.concatenate([np.load(file) for file in sorted((tmp_path / name / "events").glob("*"))]).T
+        counts.append(len(x))
+        net.append(np.zeros((HEIGHT, WIDTH)))
+        np.add.at(net[-1], (y, x), p)
+    assert np.abs(net[0] - net[1]).max() <= 1
+    assert 0.97 < counts[0] / counts[1] < 1.01
