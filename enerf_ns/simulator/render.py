@@ -21,7 +21,7 @@ GROUP = 4
 """Samples that take brightness from one place, in their middle, if they all see the same triangle."""
 
 SAMPLES = np.stack([np.arange(16), [int(f"{i:04b}"[::-1], 2) for i in range(16)]], axis=1) / 16 - 15 / 32
-"""Where in a pixel, x and y from its centre, triangles are looked for: a Hammersley set, no two in one row or column."""
+"""Where in a pixel, x and y from its centre, triangles are looked for: a Hammersley set, by quarters of the pixel."""
 SAMPLES = SAMPLES[np.lexsort((SAMPLES > 0).T)]
 
 CENTRE = np.zeros((1, 2))
