@@ -1,8 +1,8 @@
 """Pictures and depth of a scene, seen by a camera of any model.
 
-The picture is halved again and again, and with it the list of triangles that may be seen in a part of it, down to
-blocks of 64 samples in which every triangle of the list is tried. A sample sees a triangle if its direction lies on the
-inner side of the three seen through an edge and the camera: Olano, Greer: Triangle scan conversion using 2D
+The picture is quartered again and again, and with it the list of triangles that may be seen in a part of it, down to
+blocks of 256 samples in which every triangle of the list is tried. A sample sees a triangle if its direction lies on
+the inner side of the three planes through an edge and the camera: Olano, Greer: Triangle scan conversion using 2D
 homogeneous coordinates, 1997. That takes no projection and no clipping, so that a camera is a table of directions.
 """
 
@@ -20,9 +20,10 @@ from enerf_ns.simulator.scenes import Scene
 GROUP = 4
 """Samples that take brightness from one place, in their middle, if they all see the same triangle."""
 
-SAMPLES = np.stack([np.arange(16), [int(f"{i:04b}"[::-1], 2) for i in range(16)]], axis=1) / 16 - 15 / 32
+_HAMMERSLEY = np.stack([np.arange(16), [int(f"{i:04b}"[::-1], 2) for i in range(16)]], axis=1) / 16 - 15 / 32
+
+SAMPLES = _HAMMERSLEY[np.lexsort((_HAMMERSLEY > 0).T)]
 """Where in a pixel, x and y from its centre, triangles are looked for: a Hammersley set, by quarters of the pixel."""
-SAMPLES = SAMPLES[np.lexsort((SAMPLES > 0).T)]
 
 CENTRE = np.zeros((1, 2))
 
@@ -50,7 +51,7 @@ class Renderer:
 
     def __init__(self, scene: Scene, camera: Camera):
         self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
-        self._samples, self._centres = Samples.of(camera, SAMPLES), Samples.of(camera, CENTRE)
+        self._samples, self._centres = _Samples.of(camera, SAMPLES), _Samples.of(camera, CENTRE)
 
     def brightness(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width *channels"]:
         """Mean linear brightness of every pixel's area: [height, width] of a grey scene, [height, width, 3] of others.
@@ -65,7 +66,7 @@ class Renderer:
             scene.uv, scene.shade, scene.texels_per_metre, scene.texture,
             scene.texels, scene.texture_start, scene.texture_size, float(scene.background),
         )  # fmt: skip
-        picture = pixels.reshape(-1, scene.channels)[samples.places]
+        picture = pixels.reshape(-1, scene.channels)[samples.order]
         return picture if scene.channels > 1 else picture[..., 0]
 
     def depth(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width"]:
@@ -75,11 +76,11 @@ class Renderer:
             pose: Camera to world, OpenCV axes, metres.
         """
         seen, centres = _see(self.scene.triangles, np.ascontiguousarray(pose, np.float64)), self._centres
-        return _measure(seen, centres.x, centres.y, centres.nodes, centres.bounds).reshape(-1)[centres.places]
+        return _measure(seen, centres.x, centres.y, centres.nodes, centres.bounds).reshape(-1)[centres.order]
 
 
 @dataclass(frozen=True)
-class Samples:
+class _Samples:
     """Directions (x, y, 1), camera axes, in which a camera is sampled, by square blocks of pixels; and their tree."""
 
     x: Float32[np.ndarray, "blocks 256"]
@@ -87,7 +88,7 @@ class Samples:
     y: Float32[np.ndarray, "blocks 256"]
     sizes: Float32[np.ndarray, "blocks pixels"]
     """Side of a square as large as the share of a pixel that a group of samples stands for, in x and y."""
-    places: Int64[np.ndarray, "height width"]
+    order: Int64[np.ndarray, "height width"]
     """Where the pixels of the picture stand among those of all blocks."""
     nodes: Int32[np.ndarray, "nodes 3"]
     """Depth first: level (0: one block), the node that follows its last descendant, and its first block."""
@@ -95,55 +96,48 @@ class Samples:
     """Least and largest x, least and largest y of each node."""
 
     @classmethod
-    def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> Samples:
+    def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> _Samples:
         """Samples at these offsets from the centre of every pixel, x and y in pixels; 1, 4, 16 or 64 of them."""
-        directions = camera.pixel_directions()[..., :2]
-        right, down = pixel_steps(camera)
-        samples = directions[:, :, None] + offsets[:, :1] * right[:, :, None] + offsets[:, 1:] * down[:, :, None]
-        size = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) * GROUP / len(offsets))
+        directions, (right, down) = camera.pixel_directions(), pixel_steps(camera)
+        sizes = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) * GROUP / len(offsets))
         side = round((BLOCK / len(offsets)) ** 0.5)
         rows, columns = -(-camera.height // side), -(-camera.width // side)
-
-        def blocks(values: np.ndarray) -> np.ndarray:
-            padding = [(0, rows * side - camera.height), (0, columns * side - camera.width)]
-            values = np.pad(values, padding + [(0, 0)] * (values.ndim - 2), mode="edge")
-            values = values.reshape(rows, side, columns, side, *values.shape[2:]).swapaxes(1, 2)
-            return values.reshape(rows * columns, side**2, *values.shape[4:])[order]
-
         row, column = np.divmod(np.arange(rows * columns), columns)
         levels = (max(rows, columns) - 1).bit_length() + 1
         code = np.zeros_like(row)  # Morton: the blocks of every part of the picture follow each other
         for bit in range(levels):
             code |= (row >> bit & 1) << (2 * bit + 1) | (column >> bit & 1) << (2 * bit)
-        order = np.argsort(code)
-        code = code[order]
-        samples = blocks(samples).reshape(-1, BLOCK, 2).astype(np.float32)
+        along = np.argsort(code)
+        code = code[along]
 
+        def blocks(pixels: np.ndarray) -> np.ndarray:
+            """[height, width, N] as [blocks, pixels * N]; what stands over the edge repeats it."""
+            beyond = [(0, rows * side - camera.height), (0, columns * side - camera.width), (0, 0)]
+            padded = np.pad(pixels, beyond, mode="edge").reshape(rows, side, columns, side, -1)
+            return padded.swapaxes(1, 2).reshape(rows * columns, -1)[along]
+
+        def samples(axis: int) -> np.ndarray:
+            steps = right[..., axis, None] * offsets[:, 0] + down[..., axis, None] * offsets[:, 1]
+            return blocks((directions[..., axis, None] + steps).astype(np.float32))
+
+        x, y = samples(0), samples(1)
+        boxes = np.stack([x.min(1), -x.max(1), y.min(1), -y.max(1)], axis=1)
         nodes, bounds = [], []
-        lowest, highest = samples.min(1), samples.max(1)
         for level in range(levels):
             first = np.flatnonzero(np.diff(code >> 2 * level, prepend=-1))
             nodes.append(np.stack([np.full(len(first), level), np.append(first[1:], len(code)), first], axis=1))
-            least = np.minimum.reduceat(lowest, first)
-            most = np.maximum.reduceat(highest, first)
-            slack = SLACK * (most - least)
-            bounds.append(np.stack([least - slack, most + slack], axis=2).reshape(-1, 4))
-        nodes, bounds = np.concatenate(nodes), np.concatenate(bounds)
+            box = np.minimum.reduceat(boxes, first)
+            bounds.append(box + SLACK * (box + box[:, [1, 0, 3, 2]]))
+        nodes, bounds = np.concatenate(nodes), np.concatenate(bounds) * np.array([1, -1, 1, -1], np.float32)
         depth_first = np.lexsort((-nodes[:, 0], nodes[:, 2]))
         nodes = nodes[depth_first]
         nodes[:, 1] = np.searchsorted(nodes[:, 2], nodes[:, 1])
 
-        numbers = blocks(np.arange(camera.height * camera.width).reshape(camera.height, camera.width))
-        places = np.empty(camera.height * camera.width, np.int64)
-        places[numbers.reshape(-1)[::-1]] = np.arange(numbers.size)[::-1]
-        return cls(
-            np.ascontiguousarray(samples[..., 0]),
-            np.ascontiguousarray(samples[..., 1]),
-            blocks(size).astype(np.float32),
-            places.reshape(camera.height, camera.width),
-            nodes.astype(np.int32),
-            bounds[depth_first],
-        )
+        numbers = blocks(np.arange(camera.height * camera.width).reshape(camera.height, camera.width, 1)).reshape(-1)
+        _, order = np.unique(numbers, return_index=True)
+        order = order.reshape(camera.height, camera.width)
+        sizes = blocks(sizes[..., None]).astype(np.float32)
+        return cls(x, y, sizes, order, nodes.astype(np.int32), bounds[depth_first].astype(np.float32))
 
 
 def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
@@ -208,34 +202,40 @@ def _see(triangles, pose):  # pragma: no cover
 def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
     """Depth of every sample, 0 where it sees nothing, [blocks, 256]."""
     depth, closeness, faces = np.zeros(x.shape, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
-    for block in _visible(seen, x, y, nodes, bounds, faces, closeness):
+    lists, lengths = _all(seen, nodes)
+    node, block = _next(seen, x, y, nodes, bounds, 0, lists, lengths, faces, closeness)
+    while block >= 0:
         for k in range(BLOCK):
             if faces[k] >= 0:
                 depth[block, k] = ONE / closeness[k]
+        node, block = _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness)
     return depth
 
 
 @_compiled
-def _visible(seen, x, y, nodes, bounds, faces, closeness):  # pragma: no cover
-    """Goes through the blocks in which triangles may be seen.
-
-    Writes, [256] each, the triangle that every sample of the block sees (-1: none), and one over its depth (0: none).
-    """
+def _all(seen, nodes):  # pragma: no cover
+    """For `_next`: room for the triangles that may be seen at each level, and all triangles for the whole picture."""
     levels = nodes[0, 0] + 1
     lists, lengths = np.empty((levels + 1, len(seen)), np.int32), np.zeros(levels + 1, np.int64)
     lists[levels], lengths[levels] = np.arange(len(seen)), len(seen)
-    node = 0
+    return lists, lengths
+
+
+@_compiled
+def _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness):  # pragma: no cover
+    """From a node on, the next block in which triangles may be seen, and the node after it; -1: there is none.
+
+    Writes, [256] each, the triangle that every sample of the block sees (-1: none), and one over its depth (0: none).
+    """
     while node < len(nodes):
         level, after, block = nodes[node]
         lengths[level] = _select(seen, lists[level + 1, : lengths[level + 1]], bounds[node], lists[level])
-        if lengths[level] == 0:
-            node = after
-            continue
-        if level == 0:
+        node = node + 1 if lengths[level] > 0 else after
+        if level == 0 and lengths[0] > 0:
             faces[:], closeness[:] = -1, 0
             _try(seen, lists[0, : lengths[0]], x[block], y[block], faces, closeness)
-            yield block
-        node += 1
+            return node, block
+    return node, np.int32(-1)
 
 
 @_compiled
@@ -287,9 +287,11 @@ def _shade(
     px, py, face = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     pixel, share = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
     s, t, light = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty((channels, BLOCK), np.float32)
-    side, start, blend = np.empty((2, BLOCK), np.int32), np.empty((2, BLOCK), np.int64), np.empty(BLOCK, np.float32)
-    fine, coarse = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    for block in _visible(seen, x, y, nodes, bounds, faces, closeness):
+    start, side, blend = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.float32)
+    value, coarser = np.empty((channels, BLOCK), np.float32), np.empty(BLOCK, np.float32)
+    lists, lengths = _all(seen, nodes)
+    node, block = _next(seen, x, y, nodes, bounds, 0, lists, lengths, faces, closeness)
+    while block >= 0:
         count = _places(x[block], y[block], faces, pixels, px, py, face, pixel, share)
         blends = False
         end = 0
@@ -297,30 +299,43 @@ def _shade(
             begin, f = end, face[end]
             while end < count and face[end] == f:
                 end += 1
-            _interpolate(seen[f], uv[f], shade[f], px, py, begin, end, s, t, light)
-            first, finest = texture_start[texture[f]], texture_size[texture[f]]
+            first, finest, last = texture_start[texture[f]], texture_size[texture[f]], -1
+            at, size, part = first, finest, ZERO
             for k in range(begin, end):
-                if k > begin and pixel[k] == pixel[k - 1]:
-                    side[:, k], start[:, k], blend[k] = side[:, k - 1], start[:, k - 1], blend[k - 1]
-                    continue
-                near = seen[f, 9] * px[k] + seen[f, 10] * py[k] + seen[f, 11]
-                footprint = min(sizes[block, pixel[k]] * texels_per_metre[f] / near, np.float32(finest // 2))
-                level = np.log2(footprint) if footprint > ONE else ZERO
-                size = finest >> np.intp(level)
-                blend[k] = level - np.float32(np.intp(level))
-                side[0, k], start[0, k] = size, first + 4 * (finest * finest - size * size) // 3
-                side[1, k], start[1, k] = size, start[0, k]
-                if blend[k] > 0:
-                    side[1, k], start[1, k], blends = size >> 1, start[0, k] + size * size, True
+                a = seen[f, 0] * px[k] + seen[f, 1] * py[k] + seen[f, 2]
+                b = seen[f, 3] * px[k] + seen[f, 4] * py[k] + seen[f, 5]
+                c = seen[f, 6] * px[k] + seen[f, 7] * py[k] + seen[f, 8]
+                scale = ONE / (a + b + c)
+                a, b, c = a * scale, b * scale, c * scale
+                s[k] = a * uv[f, 0, 0] + b * uv[f, 1, 0] + c * uv[f, 2, 0]
+                t[k] = a * uv[f, 0, 1] + b * uv[f, 1, 1] + c * uv[f, 2, 1]
+                for channel in range(channels):
+                    light[channel, k] = a * shade[f, 0, channel] + b * shade[f, 1, channel] + c * shade[f, 2, channel]
+                if pixel[k] != last:
+                    last = pixel[k]
+                    near = seen[f, 9] * px[k] + seen[f, 10] * py[k] + seen[f, 11]
+                    footprint = min(sizes[block, last] * texels_per_metre[f] / near, np.float32(finest // 2))
+                    level = np.log2(footprint) if footprint > ONE else ZERO
+                    size = finest >> np.intp(level)
+                    at, part = first + 4 * (finest * finest - size * size) // 3, level - np.float32(np.intp(level))
+                    blends |= part > 0
+                start[k], side[k], blend[k] = at, size, part
         for channel in range(channels):
-            _look_up(texels, channel, start[0], side[0], s, t, count, fine)
-            if blends:
-                _look_up(texels, channel, start[1], side[1], s, t, count, coarse)
-                for k in range(count):
-                    fine[k] += blend[k] * (coarse[k] - fine[k])
+            _look_up(texels, channel, start, side, s, t, count, value[channel])
+        if blends:
             for k in range(count):
-                change = share[k] * (light[channel, k] * fine[k] - np.float32(background))
+                if blend[k] > 0:
+                    start[k] += side[k] * side[k]
+                    side[k] >>= 1
+            for channel in range(channels):
+                _look_up(texels, channel, start, side, s, t, count, coarser)
+                for k in range(count):
+                    value[channel, k] += blend[k] * (coarser[k] - value[channel, k])
+        for channel in range(channels):
+            for k in range(count):
+                change = share[k] * (light[channel, k] * value[channel, k] - np.float32(background))
                 picture[block, pixel[k], channel] += change
+        node, block = _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness)
     return picture
 
 
@@ -350,27 +365,10 @@ def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cove
 
 
 @_compiled
-def _interpolate(seen, uv, shade, x, y, begin, end, s, t, light):  # pragma: no cover
-    """Texture coordinates and light at some places of a triangle."""
-    a0, a1, a2, b0, b1, b2 = seen[0], seen[1], seen[2], seen[3], seen[4], seen[5]
-    c0, c1, c2 = seen[6], seen[7], seen[8]
-    sa, sb, sc, ta, tb, tc = uv[0, 0], uv[1, 0], uv[2, 0], uv[0, 1], uv[1, 1], uv[2, 1]
-    for k in range(begin, end):
-        a, b, c = a0 * x[k] + a1 * y[k] + a2, b0 * x[k] + b1 * y[k] + b2, c0 * x[k] + c1 * y[k] + c2
-        whole = ONE / (a + b + c)
-        s[k], t[k] = (a * sa + b * sb + c * sc) * whole, (a * ta + b * tb + c * tc) * whole
-    for channel in range(len(light)):
-        la, lb, lc = shade[0, channel], shade[1, channel], shade[2, channel]
-        for k in range(begin, end):
-            a, b, c = a0 * x[k] + a1 * y[k] + a2, b0 * x[k] + b1 * y[k] + b2, c0 * x[k] + c1 * y[k] + c2
-            light[channel, k] = (a * la + b * lb + c * lc) / (a + b + c)
-
-
-@_compiled
 def _look_up(texels, channel, start, side, s, t, count, value):  # pragma: no cover
     """Bilinear in the level of side x side texels from `start` on, repeating at its borders."""
     for k in range(count):
-        mask, scale = side[k] - np.int32(1), np.float32(side[k])
+        mask, scale = np.int32(side[k] - 1), np.float32(side[k])
         across, along = s[k] * scale - HALF, t[k] * scale - HALF
         left, top = np.floor(across), np.floor(along)
         dx, dy = across - left, along - top
