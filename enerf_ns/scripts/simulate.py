@@ -21,7 +21,7 @@ from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.event_recording import read_cameras
 from enerf_ns.dataparsers.recording import Events, RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.event_camera import color_channels, luma
+from enerf_ns.event_camera import color_channels, luma, pixel_brightness
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
 from enerf_ns.simulator.presets import PRESETS, SimulationPreset
@@ -127,7 +127,7 @@ class Simulate:
         notes: list[str] = []
         view = self._view(notes)
         times, exposures = self._exposures(view)
-        sensor = EventSensor(self.sensor, self._seen(view.events.brightness(view.start)), view.start)
+        sensor = EventSensor(self.sensor, self._seen(view.events.brightness(view.start), view.events), view.start)
         setup = Setup(
             event_camera=view.event_camera,
             frame_camera=view.frame_camera,
@@ -281,15 +281,17 @@ class Simulate:
             del settings[name]
         return json.loads(json.dumps(settings, default=str))
 
-    def _seen(self, picture: np.ndarray) -> np.ndarray:
-        """What the pixels of the event camera see of a picture, [height, width]."""
-        if picture.ndim == 2:
-            return picture
-        height, width = picture.shape[:2]
-        if self.bayer_pattern is None:
-            return luma(torch.from_numpy(picture)).numpy()
-        channels = color_channels(self.bayer_pattern, width, height).numpy().reshape(height, width, 1)
-        return np.take_along_axis(picture, channels, axis=2)[..., 0]
+    def _seen(self, brightness: np.ndarray, source: Source, pixels: np.ndarray | None = None) -> np.ndarray:
+        """What the pixels of the event camera, or these, see of a grey or coloured brightness, [height, width] or
+        [pixels]."""
+        shape = (source.height, source.width) if pixels is None else pixels.shape
+        if brightness.shape == shape:
+            return brightness
+        filters = None
+        if self.bayer_pattern is not None:
+            filters = color_channels(self.bayer_pattern, source.width, source.height)
+            filters = filters.view(shape) if pixels is None else filters[pixels]
+        return pixel_brightness(torch.from_numpy(brightness), filters).numpy()
 
     def _record(
         self, view: View, exposures: Exposures, sensor: EventSensor, writer: Writer, preview: Preview | None
@@ -315,9 +317,13 @@ class Simulate:
         columns = (TextColumn("Simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
         with Progress(*columns, console=CONSOLE, transient=True) as progress:
             task = progress.add_task("", total=1.0)
-            for time, picture, done in self._renders(view.events, stops):
+            for time, picture, before, done in self._renders(view.events, stops):
                 if time > view.start:
-                    add_events(sensor.advance(self._seen(picture), time))
+                    before = [
+                        part._replace(brightness=self._seen(part.brightness, view.events, part.pixels))
+                        for part in before
+                    ]
+                    add_events(sensor.advance(self._seen(picture, view.events), time, before))
                 if view.frames is None:
                     frame = exposures.add(time, self._shown(picture))
                     if frame is not None:
@@ -339,12 +345,13 @@ class Simulate:
         else:
             assert isinstance(source, TrainedRun)
             times = render_times(source.camera, source.trajectory, source.depth, stops, self.max_displacement)
-        return adaptive_renders(source.brightness, times, self.max_change, self.sensor.log_eps)
+        max_change = np.inf if isinstance(source, Pictures) else self.max_change
+        return adaptive_renders(source.brightness, times, max_change, self.sensor.log_eps)
 
     def _frames(self, source: Source, exposures: Exposures) -> Iterator[Frame]:
         """The frames of a camera of their own, which is only rendered during exposures."""
         for stops in np.stack([exposures.opens, exposures.times, exposures.closes], axis=1):
-            for time, picture, _ in self._renders(source, np.unique(stops)):
+            for time, picture, _, _ in self._renders(source, np.unique(stops)):
                 frame = exposures.add(time, self._shown(picture))
                 if frame is not None:
                     yield frame

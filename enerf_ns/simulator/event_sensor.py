@@ -24,11 +24,12 @@ threads nor on how many pictures there are: events of static scenes are the same
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from numba import njit
 
 from enerf_ns.dataparsers.recording import Events, RecordingError
@@ -94,6 +95,17 @@ class SensorSettings:
                 raise RecordingError(f"{field.name} is {value}, but must be {expected}.")
 
 
+class PartialPicture(NamedTuple):
+    """Brightness of some pixels at a time between two pictures."""
+
+    time: int
+    """Nanoseconds."""
+    pixels: Int64[np.ndarray, " pixels"]
+    """Their numbers, y * width + x."""
+    brightness: Float[np.ndarray, "pixels *channels"]
+    """Linear."""
+
+
 class _Pixels(NamedTuple):
     """What every pixel is and remembers. Levels are signal plus leak: the memory stays and the signal rises instead."""
 
@@ -154,7 +166,8 @@ class EventSensor:
             )
         self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))
         self._keys = np.random.SeedSequence(settings.seed).generate_state(4, np.uint64)
-        self._log_brightness = self._logarithm(brightness, self.time)
+        self._all = np.arange(size)
+        self._log_brightness = self._logarithm(brightness, self._all, self.time)
 
         on, off = self.contrast_thresholds.reshape(2, size)
         hot = np.zeros(size, bool)
@@ -182,7 +195,9 @@ class EventSensor:
         self._bus_free = 0.0
         """Nanoseconds since the start."""
 
-    def advance(self, brightness: Float[np.ndarray, "height width"], time: int) -> Events:
+    def advance(
+        self, brightness: Float[np.ndarray, "height width"], time: int, before: Sequence[PartialPicture] = ()
+    ) -> Events:
         """Events from the last picture to this one.
 
         Jitter and a slow bus hold events back; they come with a later call, or from `finish`.
@@ -190,6 +205,7 @@ class EventSensor:
         Args:
             brightness: as for the first picture.
             time: int nanoseconds, later than that of the last picture.
+            before: what some of the pixels saw between the last picture and this one, later one by one.
 
         Returns:
             Events in the order of their times, and after those of the last call: after the last picture (rounded up to
@@ -206,16 +222,30 @@ class EventSensor:
             )
         if time <= self.time:
             raise RecordingError(f"The picture at {time} ns must be later than the last one, at {self.time} ns.")
+        since = np.full(brightness.size, self.time)
+        parts = [self._held]
+        for picture in before:
+            if not self.time < picture.time < time:
+                raise RecordingError(
+                    f"Pixels at {picture.time} ns are not between pictures at {self.time} ns and {time} ns."
+                )
+            parts.append(self._see(picture.pixels, since, picture.brightness, picture.time))
+        parts.append(self._see(self._all, since, brightness, time))
+        self.time = time
+        pixel, times, polarity = map(np.concatenate, zip(*parts, strict=True))
+        return self._read_out(pixel, times, polarity, time - math.ceil(CUT_JITTER * self.settings.timestamp_jitter))
+
+    def _see(
+        self, pixels: np.ndarray, since: np.ndarray, brightness: np.ndarray, time: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Events of some pixels from when they were seen last, which becomes this time."""
         settings = self.settings
-        before, after = self._log_brightness, self._logarithm(brightness, time)
+        seen = self._logarithm(brightness, pixels, time)
         cutoff = 2e-9 * math.pi * settings.cutoff_frequency
-        fired = _fire(
-            self._pixels, self._keys, before, after, self.start, self.time, time,
+        return _fire(
+            self._pixels, self._keys, pixels, self._log_brightness, seen, self.start, since, time,
             settings.log_eps, cutoff, int(settings.refractory_period), settings.timestamp_jitter,
         )  # fmt: skip
-        self.time, self._log_brightness = time, after
-        pixel, times, polarity = (np.concatenate(pair) for pair in zip(self._held, fired, strict=True))
-        return self._read_out(pixel, times, polarity, time - math.ceil(CUT_JITTER * settings.timestamp_jitter))
 
     def finish(self) -> Events:
         """The events that were held back, if any. The times of those that would come after the last picture are cut to
@@ -225,7 +255,7 @@ class EventSensor:
 
     def _read_out(self, pixel: np.ndarray, times: np.ndarray, polarity: np.ndarray, settled: int) -> Events:
         """Events that no later one can come before, in the order of time; holds the others back."""
-        order = np.argsort(times, kind="stable")
+        order = np.lexsort((pixel, times))
         pixel, times, polarity = pixel[order], times[order], polarity[order]
         count = int(np.searchsorted(times, settled, "right"))
         sent = slice(count)
@@ -240,32 +270,35 @@ class EventSensor:
         y, x = np.divmod(pixel[sent].astype(np.int32), np.int32(self.width))
         return Events(x, y, times[sent], polarity[sent])
 
-    def _logarithm(self, brightness: np.ndarray, time: int) -> np.ndarray:
-        """float64 [H * W]."""
+    def _logarithm(self, brightness: np.ndarray, pixels: np.ndarray, time: int) -> np.ndarray:
+        """float64 [pixels]."""
         flat = brightness.ravel()
-        if not (flat.min() >= 0 and flat.max() < math.inf):
-            pixel = int(np.argmin((flat >= 0) & (flat < math.inf)))
+        if not (flat.min(initial=0) >= 0 and flat.max(initial=0) < math.inf):
+            wrong = int(np.argmin((flat >= 0) & (flat < math.inf)))
+            y, x = divmod(int(pixels[wrong]), self.width)
             raise RecordingError(
-                f"The picture at {time} ns is {flat[pixel]} at x = {pixel % self.width}, y = {pixel // self.width}, "
-                "but brightness must be finite and at least 0."
+                f"The picture at {time} ns is {flat[wrong]} at x = {x}, y = {y}, but brightness must be finite and at "
+                "least 0."
             )
         return np.log(flat.astype(np.float64) + self.settings.log_eps)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fire(  # pragma: no cover
-    pixels, keys, before, after, first, start, end, log_eps, cutoff, refractory_period, jitter
+    pixels, keys, which, seen, now, first, since, end, log_eps, cutoff, refractory_period, jitter
 ):
-    """Pixels, times and polarities of all events in (start, end], by pixel; moves the pixels on to `end`.
+    """Pixels, times and polarities of events from when each of some pixels was last `seen`, `since`, up to `end`.
 
-    Within the interval, times are nanoseconds since its start: `s` is when a pixel's memory was last moved, `awake` and
-    `noise` as in `_Pixels`.
+    They are in the order of `which`. Moves these pixels on to `end`, when they see `now`. Within the interval, times
+    are nanoseconds since its start: `s` is when a pixel's memory was last moved, `awake` and `noise` as in `_Pixels`.
     """
-    duration = float(end - start)
     count = 0
     pixel, times, polarity = np.empty(4096, np.int64), np.empty(4096, np.int64), np.empty(4096, np.int8)
-    for i in range(len(pixels.on)):
-        x0, x1, y0 = before[i], after[i], before[i]
+    for k in range(len(which)):
+        i = which[k]
+        start, x0, x1, y0 = since[i], seen[i], now[k], seen[i]
+        duration = float(end - start)
+        since[i], seen[i] = end, x1
         decay = 0.0
         if cutoff > 0:
             y0 = pixels.signal[i]

@@ -53,21 +53,27 @@ class Renderer:
         self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
         self._samples, self._centres = _Samples.of(camera, SAMPLES), _Samples.of(camera, CENTRE)
 
-    def brightness(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width *channels"]:
+    def brightness(
+        self, pose: Float64[np.ndarray, "3 4"], pixels: Int64[np.ndarray, " pixels"] | None = None
+    ) -> Float32[np.ndarray, "*pixels"]:
         """Mean linear brightness of every pixel's area: [height, width] of a grey scene, [height, width, 3] of others.
 
         Args:
             pose: Camera to world, OpenCV axes, metres.
+            pixels: Numbers, y * width + x, of those that are wanted: [pixels] of a grey scene, [pixels, 3] of others.
+                They have the same brightness as in a whole picture. None: the whole picture.
         """
         scene, samples = self.scene, self._samples
+        order = samples.order if pixels is None else samples.order.reshape(-1)[pixels]
+        nodes, bounds = samples.tree if pixels is None else samples.tree_above(order)
         seen = _see(scene.triangles, np.ascontiguousarray(pose, np.float64))
-        pixels = _shade(
-            seen, samples.x, samples.y, samples.nodes, samples.bounds, samples.sizes,
+        shaded = _shade(
+            seen, samples.x, samples.y, nodes, bounds, samples.sizes,
             scene.uv, scene.shade, scene.texels_per_metre, scene.texture,
             scene.texels, scene.texture_start, scene.texture_size, float(scene.background),
         )  # fmt: skip
-        picture = pixels.reshape(-1, scene.channels)[samples.order]
-        return picture if scene.channels > 1 else picture[..., 0]
+        brightness = shaded.reshape(-1, scene.channels)[order]
+        return brightness if scene.channels > 1 else brightness[..., 0]
 
     def depth(self, pose: Float64[np.ndarray, "3 4"]) -> Float32[np.ndarray, "height width"]:
         """z-depth at the centres of the pixels in metres, 0 where nothing is hit.
@@ -76,7 +82,7 @@ class Renderer:
             pose: Camera to world, OpenCV axes, metres.
         """
         seen, centres = _see(self.scene.triangles, np.ascontiguousarray(pose, np.float64)), self._centres
-        return _measure(seen, centres.x, centres.y, centres.nodes, centres.bounds).reshape(-1)[centres.order]
+        return _measure(seen, centres.x, centres.y, *centres.tree).reshape(-1)[centres.order]
 
 
 @dataclass(frozen=True)
@@ -90,10 +96,9 @@ class _Samples:
     """Side of a square as large as the share of a pixel that a group of samples stands for, in x and y."""
     order: Int64[np.ndarray, "height width"]
     """Where the pixels of the picture stand among those of all blocks."""
-    nodes: Int32[np.ndarray, "nodes 3"]
-    """Depth first: level (0: one block), the node that follows its last descendant, and its first block."""
-    bounds: Float32[np.ndarray, "nodes 4"]
-    """Least and largest x, least and largest y of each node."""
+    tree: tuple[Int32[np.ndarray, "nodes 3"], Float32[np.ndarray, "nodes 4"]]
+    """Nodes, depth first: level (0: one block), the node that follows its last descendant, and its first block.
+    And the bounds of each: least and largest x, least and largest y."""
 
     @classmethod
     def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> _Samples:
@@ -137,7 +142,22 @@ class _Samples:
         _, order = np.unique(numbers, return_index=True)
         order = order.reshape(camera.height, camera.width)
         sizes = blocks(sizes[..., None]).astype(np.float32)
-        return cls(x, y, sizes, order, nodes.astype(np.int32), bounds[depth_first].astype(np.float32))
+        return cls(x, y, sizes, order, (nodes.astype(np.int32), bounds[depth_first].astype(np.float32)))
+
+    def tree_above(
+        self, places: Int64[np.ndarray, " pixels"]
+    ) -> tuple[Int32[np.ndarray, "nodes 3"], Float32[np.ndarray, "nodes 4"]]:
+        """The part of the tree that leads to the blocks with these pixels, given by where they stand among all."""
+        nodes, bounds = self.tree
+        wanted = np.zeros(len(self.x) + 1, np.int64)
+        wanted[1 + places // self.sizes.shape[1]] = 1
+        before = np.cumsum(wanted)
+        first = np.append(nodes[:, 2], len(self.x))
+        kept = before[first[nodes[:, 1]]] > before[first[:-1]]
+        followers = np.append(0, np.cumsum(kept)).astype(np.int32)
+        nodes = nodes[kept]
+        nodes[:, 1] = followers[nodes[:, 1]]
+        return nodes, bounds[kept]
 
 
 def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
@@ -215,7 +235,7 @@ def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
 @_compiled
 def _all(seen, nodes):  # pragma: no cover
     """For `_next`: room for the triangles that may be seen at each level, and all triangles for the whole picture."""
-    levels = nodes[0, 0] + 1
+    levels = nodes[0, 0] + 1 if len(nodes) > 0 else 1
     lists, lengths = np.empty((levels + 1, len(seen)), np.int32), np.zeros(levels + 1, np.int64)
     lists[levels], lengths[levels] = np.arange(len(seen)), len(seen)
     return lists, lengths

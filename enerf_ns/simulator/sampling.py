@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from jaxtyping import Float, Float32, Int64
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.simulator.event_sensor import PartialPicture
 from enerf_ns.simulator.render import pixel_steps
 
 MOTION_STEP = 1_000_000
@@ -25,12 +25,9 @@ STEPS_PER_DEPTH = 5
 GRID = 64
 """Points that are followed, across and down the picture, or every pixel where it has fewer."""
 
-MOST_HALVINGS = 1
-"""Of an interval. A pixel is the mean of a few samples, so that an edge passes it in steps, however small its motion:
-more pictures between would show the same steps."""
-
-AHEAD = 6
-"""Pictures that are rendered before they are asked for; halved intervals may add as many."""
+MOST_HALVINGS = 3
+"""Of an interval. A pixel is the mean of 16 samples, so that an edge passes it in as many steps: from half a pixel of
+motion between pictures three halvings lead to that of one step, and more would show the steps alone."""
 
 
 class Render(NamedTuple):
@@ -40,8 +37,10 @@ class Render(NamedTuple):
     """Nanoseconds."""
     brightness: Float[np.ndarray, "height width *channels"]
     """Linear."""
+    before: list[PartialPicture]
+    """Pixels whose brightness was needed between the last picture and this one, in the order of time."""
     done: float
-    """Share of the whole sequence that ends with this picture, as far as it can be told, from 0 to 1."""
+    """Share of the pictures of the sequence that end with this one, from 0 to 1."""
 
 
 def render_times(
@@ -104,85 +103,73 @@ def render_times(
 
 
 def adaptive_renders(
-    brightness: Callable[[int], Float[np.ndarray, "height width *channels"]],
+    brightness: Callable[[int, Int64[np.ndarray, " pixels"] | None], Float[np.ndarray, "*pixels"]],
     times: Int64[np.ndarray, " times"],
     max_change: float = 0.5,
     log_eps: float = 0.001,
     threads: int = 2,
 ) -> Iterator[Render]:
-    """Pictures at the given times and, where brightness changes fast, between them.
+    """Pictures at the given times, and between them the pixels whose brightness changes fast.
 
-    An interval is halved `MOST_HALVINGS` times unless no pixel's log brightness differs by more than `max_change`
-    between its ends. Where brightness changes linearly by that much, log brightness strays by at most an eighth of its
-    square from the straight line that events are made from: 0.03, or an eighth of a threshold of 0.25, for 0.5.
+    Of such a pixel an interval is halved until its log brightness differs by no more than `max_change` between the
+    ends, or it was halved `MOST_HALVINGS` times. Where brightness changes linearly by that much, log brightness strays
+    by at most an eighth of its square from the straight line that events are made from: 0.03, or an eighth of a
+    threshold of 0.25, for 0.5.
 
-    Which pictures there are depends on their brightness alone. A few are rendered ahead; an exception of a render is
-    raised in its turn.
+    What is rendered depends on brightness alone. A few pictures are rendered ahead; an exception of a render is raised
+    in its turn.
 
     Args:
-        brightness: Linear brightness at a time (ns). Called from several threads.
-        times: Nanoseconds, strictly increasing; all of them are rendered.
-        max_change: Of the natural logarithm of log_eps + brightness.
+        brightness: As of `sources.Source`. Called from several threads.
+        times: Nanoseconds, strictly increasing; whole pictures are rendered at these and no others.
+        max_change: Of the natural logarithm of log_eps + brightness; infinite: nothing is rendered between pictures.
         log_eps: Above 0.
-        threads: How many pictures are rendered at once.
+        threads: How many render at once.
 
     Yields:
         In the order of time.
     """
     factor = np.exp(max_change)
-    shares = np.linspace(0, 1, len(times)) if len(times) > 1 else np.ones(1)
-    coming = iter(times.tolist())
+    pictures: dict[int, Future[np.ndarray]] = {}
+    partial_pictures: dict[int, Future[list[PartialPicture]]] = {}
     pool = ThreadPoolExecutor(threads)
-    pending: list[_Pending] = []
 
-    def submit(time: int, halvings: int = 0) -> _Pending:
-        return _Pending(time, pool.submit(brightness, time), halvings)
+    def submit(index: int) -> None:
+        if index < len(times):
+            pictures[index] = pool.submit(brightness, int(times[index]), None)
+        earlier = index - threads  # so that no thread has to wait for its pictures
+        if 0 < earlier < len(times):
+            partial_pictures[earlier] = pool.submit(halve, earlier)
 
-    def is_rendered(index: int) -> bool:
-        future = pending[index].future
-        return future.done() and future.exception() is None
+    def halve(index: int) -> list[PartialPicture]:
+        """The interval that ends with this picture."""
+        before, after = pictures[index - 1].result(), pictures[index].result()
+        shape = (before.shape[0] * before.shape[1], -1)
+        pixels = np.arange(shape[0])
+        return between(int(times[index - 1]), int(times[index]), pixels, before.reshape(shape), after.reshape(shape))
 
-    def halve(index: int) -> bool:
-        """Whether the interval that ends with this picture had to be halved."""
-        before, after = pending[index - 1 : index + 1]
-        if after.follows or after.halvings == MOST_HALVINGS or after.time - before.time < 2:
-            return False
-        first, second = before.future.result() + log_eps, after.future.result() + log_eps
-        after.follows = not (np.maximum(first, second) > factor * np.minimum(first, second)).any()
-        if not after.follows:
-            after.halvings += 1
-            pending.insert(index, submit((before.time + after.time) // 2, after.halvings))
-        return not after.follows
-
-    def rendered() -> Render:
-        time = pending[0].time
-        return Render(time, pending[0].future.result(), float(np.interp(time, times, shares)))
+    def between(
+        start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, halvings: int = 0
+    ) -> list[PartialPicture]:
+        first, second = before + log_eps, after + log_eps
+        changed = (np.maximum(first, second) > factor * np.minimum(first, second)).any(axis=1)
+        middle = (start + end) // 2
+        if halvings == MOST_HALVINGS or middle == start or not changed.any():
+            return []
+        pixels, before, after = pixels[changed], before[changed], after[changed]
+        picture = PartialPicture(middle, pixels, brightness(middle, pixels))
+        here = picture.brightness.reshape(before.shape)
+        earlier = between(start, middle, pixels, before, here, halvings + 1)
+        return [*earlier, picture, *between(middle, end, pixels, here, after, halvings + 1)]
 
     try:
-        pending.append(submit(next(coming)))
-        yield rendered()
-        while True:
-            while len(pending) <= AHEAD and (time := next(coming, None)) is not None:
-                pending.append(submit(time))
-            if len(pending) == 1:
-                return
-            index = 2
-            while index < len(pending) < 2 * AHEAD:
-                index += 2 if is_rendered(index - 1) and is_rendered(index) and halve(index) else 1
-            if not halve(1):
-                del pending[0]
-                yield rendered()
+        for index in range(2 * threads):
+            submit(index)
+        for index, time in enumerate(times.tolist()):
+            submit(index + 2 * threads)
+            picture = pictures[index].result()
+            between_them = partial_pictures.pop(index).result() if index > 0 else []
+            yield Render(time, picture, between_them, index / max(1, len(times) - 1))
+            pictures.pop(index - 1, None)
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-@dataclass
-class _Pending:
-    """A picture that is being rendered; the first of a list is the one that was yielded last."""
-
-    time: int
-    future: Future[np.ndarray]
-    halvings: int
-    """Of the interval that ends with it."""
-    follows: bool = False
-    """Whether it is known to be close enough to the one before."""

@@ -47,13 +47,14 @@ class Source(Protocol):
     end: int
     """Last time at which it can be seen, ns."""
 
-    def brightness(self, time: int) -> Float[np.ndarray, "height width *channels"]:
+    def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
         """Linear brightness, 0 or more, grey [height, width] or R G B [height, width, 3].
 
         May be called from several threads at once.
 
         Args:
             time: ns, from `start` to `end`.
+            pixels: Numbers, y * width + x, of those that are wanted: grey [pixels] or R G B [pixels, 3]. None: all.
         """
         ...
 
@@ -66,9 +67,9 @@ class RenderedScene:
         self.width, self.height = renderer.width, renderer.height
         self.start, self.end = trajectory.start, trajectory.end
 
-    def brightness(self, time: int) -> Float[np.ndarray, "height width *channels"]:
+    def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
         """As of `Source`."""
-        return self.renderer.brightness(_pose(self.trajectory, time))
+        return self.renderer.brightness(_pose(self.trajectory, time), pixels)
 
     def depth(self, time: int) -> Float32[np.ndarray, "height width"]:
         """z-depth in metres, 0 where nothing is hit."""
@@ -97,7 +98,9 @@ class Pictures(ABC):
     def _load(self, index: int) -> Shaped[np.ndarray, "height width *channels"]:
         """One picture as it is stored, uint8 or uint16, grey or R G B."""
 
-    def brightness(self, time: int) -> Float32[np.ndarray, "height width *channels"]:
+    def brightness(
+        self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
+    ) -> Float32[np.ndarray, "*pixels"]:
         """As of `Source`.
 
         Raises:
@@ -106,11 +109,14 @@ class Pictures(ABC):
         if not self.start <= time <= self.end:
             raise ValueError(f"{self.path} was asked for {time} ns, but lasts from {self.start} to {self.end} ns.")
         before = int(np.searchsorted(self.times, time, side="right")) - 1
+        first = self._linear(before)
         if time == self.times[before]:
-            return self._linear(before).copy()
-        first, second = (np.log(self.log_eps + self._linear(index)) for index in (before, before + 1))
-        passed = (time - self.times[before]) / (self.times[before + 1] - self.times[before])
-        return np.maximum(np.exp(first + np.float32(passed) * (second - first)) - np.float32(self.log_eps), 0)
+            picture = first.copy()
+        else:
+            first, second = np.log(self.log_eps + first), np.log(self.log_eps + self._linear(before + 1))
+            passed = (time - self.times[before]) / (self.times[before + 1] - self.times[before])
+            picture = np.maximum(np.exp(first + np.float32(passed) * (second - first)) - np.float32(self.log_eps), 0)
+        return picture if pixels is None else picture.reshape(-1, *picture.shape[2:])[pixels]
 
     def _load_linear(self, index: int) -> np.ndarray:
         picture = self._load(index)
@@ -293,9 +299,11 @@ class TrainedRun:
         self.width, self.height = self.camera.width, self.camera.height
         self.start, self.end = self.trajectory.start, self.trajectory.end
 
-    def brightness(self, time: int) -> Float32[np.ndarray, "height width *channels"]:
+    def brightness(
+        self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
+    ) -> Float32[np.ndarray, "*pixels"]:
         """As of `Source`; grey where the field is."""
-        rgb = self._render(time, "rgb")
+        rgb = self._render(time, "rgb", pixels)
         if not self._is_linear:
             return linear_from_srgb(rgb.clip(0, 1)).astype(np.float32)
         return rgb[..., 0] if self._model.config.num_channels == 1 else rgb
@@ -308,8 +316,10 @@ class TrainedRun:
         return depth.astype(np.float32)
 
     @torch.no_grad()
-    def _render(self, time: int, output: str) -> np.ndarray:
+    def _render(self, time: int, output: str, pixels: np.ndarray | None = None) -> np.ndarray:
+        """[height, width, channels], or [pixels, channels] of those that are wanted."""
         from nerfstudio.cameras.cameras import Cameras
+        from nerfstudio.models.base_model import Model
 
         rotation, shift = self._transform[:, :3], self._transform[:, 3]
         pose = rotation @ _pose(self.trajectory, time)
@@ -322,12 +332,23 @@ class TrainedRun:
             cy=self.camera.cy + 0.5,
             width=self.camera.width,
             height=self.camera.height,
-        )
+        ).to(self._model.device)
+        casts_rays = type(self._model).get_outputs_for_camera is Model.get_outputs_for_camera
         with self._lock:
-            outputs = self._model.get_outputs_for_camera(camera.to(self._model.device))
+            if pixels is not None and casts_rays:
+                row, column = np.divmod(pixels, self.width)
+                places = torch.from_numpy(np.stack([row, column], axis=-1)[:, None] + 0.5).float()
+                rays = camera.generate_rays(camera_indices=0, coords=places.to(self._model.device))
+                outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
+            else:
+                outputs = self._model.get_outputs_for_camera(camera)
         if output not in outputs:
             raise RecordingError(f"{self.config} is a run of a method that renders no {output}; give one that does.")
-        return outputs[output].float().cpu().numpy()
+        values = outputs[output].float().cpu().numpy()
+        if pixels is None:
+            return values
+        values = values.reshape(-1, values.shape[-1])
+        return values if casts_rays else values[pixels]
 
     def _past(self, cameras: Any, duration: int) -> Trajectory:
         """Through cameras of the training, in the world of the run's data."""
