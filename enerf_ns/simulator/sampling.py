@@ -25,6 +25,12 @@ STEPS_PER_DEPTH = 5
 GRID = 64
 """Points that are followed, across and down the picture, or every pixel where it has fewer."""
 
+MAX_DISPLACEMENT = 0.5
+"""Pixels, from one picture to the next."""
+
+MAX_CHANGE = 0.3
+"""Of log brightness, from one time at which a pixel is rendered to the next."""
+
 MOST_HALVINGS = 3
 """Of an interval. A pixel is the mean of 16 samples, so that an edge passes it in as many steps: from half a pixel of
 motion between pictures three halvings lead to that of one step, and more would show the steps alone."""
@@ -48,7 +54,7 @@ def render_times(
     trajectory: Trajectory,
     depth: Callable[[int], Float32[np.ndarray, "height width"]],
     stops: Int64[np.ndarray, " stops"],
-    max_displacement: float,
+    max_displacement: float = MAX_DISPLACEMENT,
     threads: int = 2,
 ) -> Int64[np.ndarray, " times"]:
     """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
@@ -105,16 +111,17 @@ def render_times(
 def adaptive_renders(
     brightness: Callable[[int, Int64[np.ndarray, " pixels"] | None], Float[np.ndarray, "*pixels"]],
     times: Int64[np.ndarray, " times"],
-    max_change: float = 0.5,
+    max_change: float = MAX_CHANGE,
     log_eps: float = 0.001,
     threads: int = 2,
 ) -> Iterator[Render]:
-    """Pictures at the given times, and between them the pixels whose brightness changes fast.
+    """Pictures at the given times, and between them the pixels of which they do not tell enough.
 
-    Of such a pixel an interval is halved until its log brightness differs by no more than `max_change` between the
-    ends, or it was halved `MOST_HALVINGS` times. Where brightness changes linearly by that much, log brightness strays
-    by at most an eighth of its square from the straight line that events are made from: 0.03, or an eighth of a
-    threshold of 0.25, for 0.5.
+    Between two times at which a pixel is rendered its log brightness differs by no more than `max_change`, and strays
+    by no more than an eighth of the square of that from the straight line that events are made from: by 0.011 for 0.3.
+    So far strays the logarithm of a brightness that changes linearly by `max_change`; of others the error is estimated
+    by second differences, which also tell where a pixel becomes darker and brighter again. Where either is more, the
+    interval is halved, at most `MOST_HALVINGS` times.
 
     What is rendered depends on brightness alone. A few pictures are rendered ahead; an exception of a render is raised
     in its turn.
@@ -129,7 +136,7 @@ def adaptive_renders(
     Yields:
         In the order of time.
     """
-    factor = np.exp(max_change)
+    max_error = max_change**2 / 8
     pictures: dict[int, Future[np.ndarray]] = {}
     partial_pictures: dict[int, Future[list[PartialPicture]]] = {}
     pool = ThreadPoolExecutor(threads)
@@ -137,30 +144,42 @@ def adaptive_renders(
     def submit(index: int) -> None:
         if index < len(times):
             pictures[index] = pool.submit(brightness, int(times[index]), None)
-        earlier = index - threads  # so that no thread has to wait for its pictures
+        earlier = index - threads - 1  # so that no thread waits for a picture that no other one has begun with
         if 0 < earlier < len(times):
             partial_pictures[earlier] = pool.submit(halve, earlier)
 
     def halve(index: int) -> list[PartialPicture]:
         """The interval that ends with this picture."""
-        before, after = pictures[index - 1].result(), pictures[index].result()
-        shape = (before.shape[0] * before.shape[1], -1)
-        pixels = np.arange(shape[0])
-        return between(int(times[index - 1]), int(times[index]), pixels, before.reshape(shape), after.reshape(shape))
+        if max_change == np.inf:
+            return []
+        around = range(max(0, index - 2), min(len(times), index + 2))
+        seen = [pictures[i].result() for i in around]
+        levels = [np.log(picture.reshape(picture.shape[0] * picture.shape[1], -1) + log_eps) for picture in seen]
+        ends = slice(index - 1 - around[0], index + 1 - around[0])
+        start, end = times[index - 1 : index + 1].tolist()
+        error = np.zeros_like(levels[0])
+        for i in range(len(around) - 2):
+            bend = _bend(times[around[i : i + 3]] * 1.0, levels[i : i + 3])
+            np.maximum(error, bend * np.float32((end - start) ** 2 / 8), out=error)
+        return between(start, end, np.arange(len(error)), *levels[ends], error)
 
     def between(
-        start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, halvings: int = 0
+        start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, error: np.ndarray, halvings=0
     ) -> list[PartialPicture]:
-        first, second = before + log_eps, after + log_eps
-        changed = (np.maximum(first, second) > factor * np.minimum(first, second)).any(axis=1)
+        """An interval of some pixels: log brightness before and after it, and by how much it may stray from a line."""
+        wrong = ((np.abs(after - before) > max_change) | (error > max_error)).any(axis=1)
         middle = (start + end) // 2
-        if halvings == MOST_HALVINGS or middle == start or not changed.any():
+        if halvings == MOST_HALVINGS or middle == start or not wrong.any():
             return []
-        pixels, before, after = pixels[changed], before[changed], after[changed]
+        pixels, before, after = pixels[wrong], before[wrong], after[wrong]
         picture = PartialPicture(middle, pixels, brightness(middle, pixels))
-        here = picture.brightness.reshape(before.shape)
-        earlier = between(start, middle, pixels, before, here, halvings + 1)
-        return [*earlier, picture, *between(middle, end, pixels, here, after, halvings + 1)]
+        here = np.log(picture.brightness.reshape(before.shape) + log_eps)
+        error = np.abs(before - 2 * here + after) / 8
+        return [
+            *between(start, middle, pixels, before, here, error, halvings + 1),
+            picture,
+            *between(middle, end, pixels, here, after, error, halvings + 1),
+        ]
 
     try:
         for index in range(2 * threads):
@@ -168,8 +187,15 @@ def adaptive_renders(
         for index, time in enumerate(times.tolist()):
             submit(index + 2 * threads)
             picture = pictures[index].result()
-            between_them = partial_pictures.pop(index).result() if index > 0 else []
-            yield Render(time, picture, between_them, index / max(1, len(times) - 1))
-            pictures.pop(index - 1, None)
+            before = partial_pictures.pop(index).result() if index > 0 else []
+            yield Render(time, picture, before, index / max(1, len(times) - 1))
+            pictures.pop(index - 2, None)
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _bend(times: np.ndarray, levels: list[np.ndarray]) -> np.ndarray:
+    """Magnitude of the second derivative of what has these three levels at these times."""
+    first, second = times[1] - times[0], times[2] - times[1]
+    slopes = (levels[2] - levels[1]) / second - (levels[1] - levels[0]) / first
+    return np.abs(slopes) * (2 / (first + second))
