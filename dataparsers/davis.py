@@ -10,13 +10,13 @@ Mueggler et al., "The event-camera dataset and simulator", International Journal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import (
     EventRecording,
@@ -120,7 +120,7 @@ def _first_event_time(path: Path) -> int:
     if not line.strip():
         raise RecordingError(f"{path} is empty; events ({EVENT_COLUMNS}) were expected.")
     columns = tuple(np.empty(1, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
-    if _line_parser()(np.frombuffer(line, np.uint8), *columns) == 0:
+    if compiled(_parse_lines)(np.frombuffer(line, np.uint8), *columns) == 0:
         raise _bad_line(path, 1, line)
     return int(columns[0][0])
 
@@ -131,7 +131,7 @@ def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
     end = len(text)
     while end and text[end - 1] in b" \t\r\n":
         end -= 1
-    parse, num_events, start = _line_parser(), 0, 0
+    parse, num_events, start = compiled(_parse_lines), 0, 0
     while start < end:
         stop = min(start + BYTES_AT_A_TIME, end)
         while stop < end and text[stop - 1] != ord("\n"):
@@ -237,13 +237,3 @@ def _parse_lines(text, t, x, y, p):
             i += 1
         i += 1
     return len(t)
-
-
-@cache
-def _line_parser() -> Callable[..., int]:
-    import numba  # here, since importing it takes longer than reading a small recording
-
-    try:
-        return numba.njit(cache=True)(_parse_lines)
-    except RuntimeError:  # there is no folder to write the cache to
-        return numba.njit(_parse_lines)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Int, Int32, Int64, UInt8
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
+from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.recording import Events
 
 if TYPE_CHECKING:
@@ -189,7 +190,7 @@ class Survey:
         The neighbourhood is 5 x 5 pixels; beyond the border, the pixel there is repeated.
         """
         hot = np.zeros(len(self.counts), bool)
-        _compiled(_find_hot)(self.counts, self.width, height, HOT_RATIO, HOT_FLOOR, hot)
+        compiled(_find_hot)(self.counts, self.width, height, HOT_RATIO, HOT_FLOOR, hot)
         self.hot_pixels = np.flatnonzero(hot)
         self.num_hot_events = int(self.counts[self.hot_pixels].sum())
         self.counts[self.hot_pixels] = 0
@@ -210,7 +211,7 @@ def survey_events(stream: EventStream, width: int, height: int, start: int, end:
     survey = Survey(width, start, end, np.zeros(width * height, np.int32))
     state = np.zeros(3, np.int64)  # time of the latest event; whether polarity 0, and whether -1, was seen
     state[0] = -(2**63)
-    scan = _compiled(_scan)
+    scan = compiled(_scan)
     for events in stream():
         x, y, p = _narrow(events.x), _narrow(events.y), _narrow(events.p)
         fault, place = scan(x, y, events.t, p, width, height, start, end, survey.counts, state)
@@ -245,7 +246,7 @@ def sorted_bands(
     offsets = survey.offsets.numpy()
     keep = np.ones(len(survey.counts), bool)
     keep[survey.hot_pixels] = False
-    place = _compiled(_place)
+    place = compiled(_place)
     first, num_positive = 0, np.int32(0)
     while first < len(survey.counts):
         stop = max(int(np.searchsorted(offsets, offsets[first] + max_events, side="right")) - 1, first + 1)
@@ -350,13 +351,3 @@ def _find_hot(counts, width, height, ratio, floor, hot):
                     y = min(max(pixel // width + dy, 0), height - 1)
                     below += ratio * counts[y * width + x] < counts[pixel]
             hot[pixel] = below >= 13
-
-
-@cache
-def _compiled(function):
-    import numba  # here, since importing it takes longer than reading a small recording
-
-    try:
-        return numba.njit(cache=True)(function)
-    except RuntimeError:  # there is no folder to write the cache to
-        return numba.njit(function)

@@ -11,21 +11,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-
-def _jit(function: Callable) -> Callable:
-    try:
-        return numba.njit(nogil=True, cache=True)(function)
-    except RuntimeError:  # there is no directory to write the cache to
-        return numba.njit(nogil=True)(function)
+from enerf_ns.compiled import compiled
 
 
-@_jit
+@compiled
 def _cell(x, i, scaling):
     """Of position i: for each of the 4 edges along x of its cell, the hash of y and z with the weight; then the hash
     and the weight of either end in x; then the weights of y and z."""
@@ -41,7 +35,7 @@ def _cell(x, i, scaling):
     return edges, (low0, high0), (v0, w0), (v1, w1), (v2, w2)
 
 
-@_jit
+@compiled
 def _forward(x, table, scaling, encoding):
     mask = len(table) - 1
     for i in range(len(x)):
@@ -55,7 +49,7 @@ def _forward(x, table, scaling, encoding):
         encoding[i, 0], encoding[i, 1] = sum0, sum1
 
 
-@_jit
+@compiled
 def _backward_table(x, grad_encoding, scaling, grad_table):
     mask = len(grad_table) - 1
     grad_table[:] = 0
@@ -71,7 +65,7 @@ def _backward_table(x, grad_encoding, scaling, grad_table):
             grad_table[b, 1] += weight_b * grad1
 
 
-@_jit
+@compiled
 def _backward_x(x, grad_encoding, scaling, table, grad_x):
     mask = len(table) - 1
     for i in range(len(x)):

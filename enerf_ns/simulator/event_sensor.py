@@ -30,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from numba import njit
 
+from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.recording import Events, RecordingError
 
 READOUT_QUEUE = 1000
@@ -283,7 +283,7 @@ class EventSensor:
         return np.log(flat.astype(np.float64) + self.settings.log_eps)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fire(  # pragma: no cover
     pixels, keys, which, seen, now, first, since, end, log_eps, cutoff, refractory_period, jitter
 ):
@@ -364,7 +364,7 @@ def _fire(  # pragma: no cover
     return pixel[:count], times[:count], polarity[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _level(curve, s):  # pragma: no cover
     """Level at s: the low pass of a line, plus leak.
 
@@ -378,7 +378,7 @@ def _level(curve, s):  # pragma: no cover
     return level + leak * s + pull * done + slope * (s - done / decay)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _turn(curve):  # pragma: no cover
     """When the level is highest or lowest; infinity if it always rises or always falls."""
     _, pull, slope, leak, decay = curve
@@ -386,7 +386,7 @@ def _turn(curve):  # pragma: no cover
     return -np.log(remaining) / decay if decay > 0 and 0 < remaining < 1 else np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _next_crossing(curve, turn, s, stop, lower, upper):  # pragma: no cover
     """First time from s to stop that the level reaches upper (+1) or lower (-1); else 0 and s."""
     since = s
@@ -402,7 +402,7 @@ def _next_crossing(curve, turn, s, stop, lower, upper):  # pragma: no cover
     return 0, s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _reached(curve, wanted, low, high):  # pragma: no cover
     """When a level that only rises, or only falls, from low to high reaches the one wanted.
 
@@ -428,14 +428,14 @@ def _reached(curve, wanted, low, high):  # pragma: no cover
     return s
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _longer(values):  # pragma: no cover
     longer = np.empty(2 * len(values), values.dtype)
     longer[: len(values)] = values
     return longer
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _random(key, pixel, number):  # pragma: no cover
     """64 random bits: place `pixel * 2^32 + number` of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
     place = (np.uint64(pixel) << np.uint64(32)) + np.uint64(number)
@@ -445,26 +445,26 @@ def _random(key, pixel, number):  # pragma: no cover
     return bits ^ (bits >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _uniform(bits):  # pragma: no cover
     """In (0, 1], of the upper 53 bits."""
     return (np.float64(bits >> np.uint64(11)) + 1) * 2.0**-53
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _normal(keys, pixel, number):  # pragma: no cover
     """By Box and Muller's method."""
     radius = np.sqrt(-2 * np.log(_uniform(_random(keys[2], pixel, number))))
     return min(max(radius * np.cos(2 * np.pi * _uniform(_random(keys[3], pixel, number))), -CUT_JITTER), CUT_JITTER)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _gap(key, pixel, number, rate):  # pragma: no cover
     """Nanoseconds, at least 1, from one event of a Poisson process to the next."""
     return int(max(np.ceil(min(-np.log(_uniform(_random(key, pixel, number))) / rate, 1e18)), 1.0))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _first_noise(pixels, keys):  # pragma: no cover
     for i in range(len(pixels.on)):
         if pixels.noise_rate[i] > 0:
@@ -473,7 +473,7 @@ def _first_noise(pixels, keys):  # pragma: no cover
             pixels.noise[i] = NEVER
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _transmit(times, first, end, free, rate):  # pragma: no cover
     """When the bus has carried each event, nanoseconds, and `first - 1` for those that are lost; ends with the last
     that it carries before `end`.

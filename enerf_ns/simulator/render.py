@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
-from numba import njit
 
+from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.simulator.scenes import Scene
 
@@ -32,8 +32,6 @@ BLOCK = 256
 
 SLACK = 1e-4
 """By how much of its size a part of the picture is taken larger than it is, against rounding."""
-
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
@@ -176,7 +174,7 @@ def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], 
     return step(1, (1 / camera.fx, 0)), step(0, (0, 1 / camera.fy))
 
 
-@_compiled
+@compiled
 def _see(triangles, pose):  # pragma: no cover
     """What tells where a direction (x, y, 1) of camera axes hits each triangle, float32 [F, 16].
 
@@ -218,7 +216,7 @@ def _see(triangles, pose):  # pragma: no cover
     return seen
 
 
-@_compiled
+@compiled
 def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
     """Depth of every sample, 0 where it sees nothing, [blocks, 256]."""
     depth, closeness, faces = np.zeros(x.shape, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
@@ -232,7 +230,7 @@ def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
     return depth
 
 
-@_compiled
+@compiled
 def _all(seen, nodes):  # pragma: no cover
     """For `_next`: room for the triangles that may be seen at each level, and all triangles for the whole picture."""
     levels = nodes[0, 0] + 1 if len(nodes) > 0 else 1
@@ -241,7 +239,7 @@ def _all(seen, nodes):  # pragma: no cover
     return lists, lengths
 
 
-@_compiled
+@compiled
 def _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness):  # pragma: no cover
     """From a node on, the next block in which triangles may be seen, and the node after it; -1: there is none.
 
@@ -258,7 +256,7 @@ def _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness):  #
     return node, np.int32(-1)
 
 
-@_compiled
+@compiled
 def _select(seen, candidates, bounds, selected):  # pragma: no cover
     """Selects triangles whose box meets the bounds and that have a corner of these within each edge; counts them."""
     left, right, top, bottom = bounds[0], bounds[1], bounds[2], bounds[3]
@@ -273,7 +271,7 @@ def _select(seen, candidates, bounds, selected):  # pragma: no cover
     return count
 
 
-@_compiled
+@compiled
 def _try(seen, candidates, x, y, faces, closeness):  # pragma: no cover
     """Which of the triangles the samples of a block see."""
     for f in candidates:
@@ -292,7 +290,7 @@ def _try(seen, candidates, x, y, faces, closeness):  # pragma: no cover
             faces[k] = f if hit else faces[k]
 
 
-@_compiled
+@compiled
 def _shade(
     seen, x, y, nodes, bounds, sizes,
     uv, shade, texels_per_metre, texture, texels, texture_start, texture_size, background,
@@ -359,7 +357,7 @@ def _shade(
     return picture
 
 
-@_compiled
+@compiled
 def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cover
     """Where a block takes brightness from, in which triangle, for which pixel and by which share; counts these places.
 
@@ -384,7 +382,7 @@ def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cove
     return count
 
 
-@_compiled
+@compiled
 def _look_up(texels, channel, start, side, s, t, count, value):  # pragma: no cover
     """Bilinear in the level of side x side texels from `start` on, repeating at its borders."""
     for k in range(count):
