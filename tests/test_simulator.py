@@ -12,92 +12,24 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import trimesh
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
-from trimesh.ray import ray_triangle
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import RecordingError, read_recording
 from enerf_ns.scripts.simulate import Simulate
-from enerf_ns.simulator import textures
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.render import Renderer
 from enerf_ns.simulator.sampling import render_times
-from enerf_ns.simulator.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.trajectories import MOTIONS, look_at
 
 WIDTH, HEIGHT = 48, 36
 SHORT: dict[str, Any] = dict(duration=0.3, num_frames=12, width=WIDTH, height=HEIGHT)
 
 
-def plane(depth: float, image: np.ndarray) -> Scene:
-    """A plane z = depth of 4 by 4 metres, as large as its texture, whose origin is at x = y = 0."""
-    corners = np.array([[-2, -2, depth], [2, -2, depth], [2, 2, depth], [-2, 2, depth]])
-    triangles = corners[[[0, 1, 2], [0, 2, 3]]]
-    surface = Surface(triangles, triangles[..., :2] / 4, np.ones((2, 3, 1)), image[..., None])
-    return build_scene([surface], (0, 0, 0), (0, 0, depth))
-
-
 def camera_of(width: int, height: int, focal_length: float) -> Camera:
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
-
-
-def pose_of(rotation: Rotation, position: list[float]) -> np.ndarray:
-    return np.column_stack([rotation.as_matrix(), position])
-
-
-def test_plane_seen_from_the_front_has_its_distance_as_depth_and_its_brightness():
-    renderer = Renderer(plane(1.7, np.full((textures.SIZE, textures.SIZE), 0.6)), camera_of(WIDTH, HEIGHT, 40.0))
-    pose = pose_of(Rotation.from_euler("z", 20, degrees=True), [0.1, -0.2, 0.3])
-    np.testing.assert_allclose(renderer.depth(pose), 1.4, atol=1e-5)
-    np.testing.assert_allclose(renderer.brightness(pose), 0.6, atol=1e-6)
-
-
-def test_rays_that_hit_nothing_have_depth_and_brightness_zero():
-    renderer = Renderer(plane(1.0, np.ones((1, 1))), camera_of(WIDTH, HEIGHT, 40.0))
-    away = pose_of(Rotation.from_euler("y", 180, degrees=True), [0, 0, 0])
-    assert (renderer.depth(away) == 0).all() and (renderer.brightness(away) == 0).all()
-
-
-def test_a_dot_is_drawn_where_opencv_projects_it():
-    spot = np.array([0.25, -0.125])
-    image = np.zeros((textures.SIZE, textures.SIZE))
-    column, row = np.round(spot * textures.TEXELS_PER_METRE).astype(int)
-    image[row - 4 : row + 4, column - 4 : column + 4] = 1
-    renderer = Renderer(plane(2.0, image), camera_of(160, 120, 150.0))
-    rotation, position = Rotation.from_euler("xyz", [6, -8, 15], degrees=True), np.array([0.2, 0.1, 0.4])
-    drawn = renderer.brightness(pose_of(rotation, position.tolist()))
-    centre = [(drawn * grid).sum() / drawn.sum() for grid in np.meshgrid(np.arange(160), np.arange(120))]
-    matrix = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
-    world_to_camera = rotation.inv()
-    expected, _ = cv2.projectPoints(
-        np.array([[*spot, 2.0]]), world_to_camera.as_rotvec(), -world_to_camera.apply(position), matrix, np.zeros(4)
-    )
-    np.testing.assert_allclose(centre, expected.ravel(), atol=0.05)
-
-
-def test_a_minified_texture_keeps_its_mean():
-    checks = (np.indices((textures.SIZE, textures.SIZE)) // 2).sum(0) % 2
-    renderer = Renderer(plane(1.5, checks), camera_of(WIDTH, HEIGHT, 24.0))
-    np.testing.assert_allclose(renderer.brightness(pose_of(Rotation.identity(), [0, 0, 0])), 0.5, atol=0.01)
-
-
-def test_what_is_seen_is_what_trimesh_finds_nearest():
-    scene = SCENES["shapes"](np.random.default_rng(0))
-    camera = camera_of(WIDTH, HEIGHT, 40.0)
-    trajectory = MOTIONS["shake"](10**9, scene.camera, scene.target, np.random.default_rng(1))
-    pose = trajectory.poses(torch.tensor(345_678_901)).numpy()
-    mesh = trimesh.Trimesh(
-        scene.triangles.reshape(-1, 3), np.arange(3 * len(scene.triangles)).reshape(-1, 3), process=False
-    )
-    rays = camera.pixel_directions().reshape(-1, 3)
-    origins = np.tile(pose[:, 3], (len(rays), 1))
-    points, ray, _ = ray_triangle.RayMeshIntersector(mesh).intersects_location(origins, rays @ pose[:, :3].T)
-    depth = np.full(len(rays), np.inf)
-    np.minimum.at(depth, ray, (points - pose[:, 3]) @ pose[:, 2])
-    found = Renderer(scene, camera).depth(pose).ravel()
-    assert np.mean(np.abs(found - depth) < 1e-3) > 0.995  # a ray along an edge may go to either side
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -270,7 +202,7 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
         (dict(scene=None), "Give either what is to be seen"),
         (dict(from_run=Path("config.yml")), "Give either what is to be seen"),
         (dict(layout="tum_vie"), "1280 x 720"),
-        (dict(cameras=Path("nowhere.json")), "nowhere.json is missing"),
+        (dict(cameras=Path("nowhere.json"), width=None, height=None), "nowhere.json is missing"),
         (dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),
     ],
 )

@@ -33,6 +33,9 @@ BLOCK = 256
 SLACK = 1e-4
 """By how much of its size a part of the picture is taken larger than it is, against rounding."""
 
+EDGE_ON = 1e-7
+"""Sine of the angle between a triangle and the ray to one of its corners below which it is not seen."""
+
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
@@ -64,9 +67,11 @@ class Renderer:
         scene, samples = self.scene, self._samples
         order = samples.order if pixels is None else samples.order.reshape(-1)[pixels]
         nodes, bounds = samples.tree if pixels is None else samples.tree_above(order)
-        seen = _see(scene.triangles, np.ascontiguousarray(pose, np.float64))
+        wanted = np.full(samples.sizes.shape, pixels is None)
+        wanted.reshape(-1)[order] = True
+        seen, faces = _see(scene.triangles, np.ascontiguousarray(pose, np.float64), samples.tree[1][0])
         shaded = _shade(
-            seen, samples.x, samples.y, nodes, bounds, samples.sizes,
+            seen, faces, samples.x, samples.y, nodes, bounds, samples.sizes, wanted,
             scene.uv, scene.shade, scene.texels_per_metre, scene.texture,
             scene.texels, scene.texture_start, scene.texture_size, float(scene.background),
         )  # fmt: skip
@@ -79,7 +84,8 @@ class Renderer:
         Args:
             pose: Camera to world, OpenCV axes, metres.
         """
-        seen, centres = _see(self.scene.triangles, np.ascontiguousarray(pose, np.float64)), self._centres
+        centres = self._centres
+        seen, _ = _see(self.scene.triangles, np.ascontiguousarray(pose, np.float64), centres.tree[1][0])
         return _measure(seen, centres.x, centres.y, *centres.tree).reshape(-1)[centres.order]
 
 
@@ -175,19 +181,22 @@ def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], 
 
 
 @compiled
-def _see(triangles, pose):  # pragma: no cover
-    """What tells where a direction (x, y, 1) of camera axes hits each triangle, float32 [F, 16].
+def _see(triangles, pose, view):  # pragma: no cover
+    """What tells where a direction (x, y, 1) of camera axes hits each triangle that may be in view, float32 [N, 16];
+    and which triangles these are.
 
     Four vectors: of the direction's inner products with the first three none is negative where it hits the triangle,
     and they are in the proportion of the weights of the corners; that with the fourth is one over the depth. Elsewhere
     one of them is negative. An edge that two triangles share has the same vector in both, but for its sign, so that no
-    direction slips through. Then a box around the triangle: least and largest x, least and largest y.
+    direction slips through; at a corner that several share one may, within rounding. Then a box around the triangle:
+    least and largest x, least and largest y, as in `view`.
     """
-    seen = np.zeros((len(triangles), 16), np.float32)
-    corners, normals, box = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
+    seen, faces = np.empty((len(triangles), 16), np.float32), np.empty(len(triangles), np.int32)
+    corners, normals, normal = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    count = 0
     for f in range(len(triangles)):
         nearest, farthest = np.inf, 0.0
-        box[0], box[1], box[2], box[3] = np.inf, -np.inf, np.inf, -np.inf
+        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
         for k in range(3):
             x, y, z = triangles[f, k, 0] - pose[0, 3], triangles[f, k, 1] - pose[1, 3], triangles[f, k, 2] - pose[2, 3]
             for axis in range(3):
@@ -195,25 +204,30 @@ def _see(triangles, pose):  # pragma: no cover
             x, y, z = corners[k]
             nearest, farthest = min(nearest, z), max(farthest, z)
             if z > 0:
-                box[0], box[1] = min(box[0], x / z), max(box[1], x / z)
-                box[2], box[3] = min(box[2], y / z), max(box[3], y / z)
+                left, right, top, bottom = min(left, x / z), max(right, x / z), min(top, y / z), max(bottom, y / z)
         if nearest <= 0 < farthest:
-            box[0], box[1], box[2], box[3] = -np.inf, np.inf, -np.inf, np.inf
+            left, right, top, bottom = -np.inf, np.inf, -np.inf, np.inf
+        if not (left <= view[1] and right >= view[0] and top <= view[3] and bottom >= view[2]):
+            continue
         for k in range(3):
             a, b = corners[(k + 1) % 3], corners[(k + 2) % 3]
             for axis in range(3):
                 i, j = (axis + 1) % 3, (axis + 2) % 3
                 normals[k, axis] = a[i] * b[j] - a[j] * b[i]
         volume = corners[0, 0] * normals[0, 0] + corners[0, 1] * normals[0, 1] + corners[0, 2] * normals[0, 2]
-        if volume == 0:
-            box[0] = np.inf
-            volume = 1.0
+        for axis in range(3):
+            normal[axis] = normals[0, axis] + normals[1, axis] + normals[2, axis]
+        size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        if abs(volume) <= EDGE_ON * size * np.sqrt(corners[0, 0] ** 2 + corners[0, 1] ** 2 + corners[0, 2] ** 2):
+            continue
         for axis in range(3):
             for k in range(3):
-                seen[f, 3 * k + axis] = normals[k, axis] if volume > 0 else -normals[k, axis]
-            seen[f, 9 + axis] = (normals[0, axis] + normals[1, axis] + normals[2, axis]) / volume
-        seen[f, 12:] = box
-    return seen
+                seen[count, 3 * k + axis] = normals[k, axis] if volume > 0 else -normals[k, axis]
+            seen[count, 9 + axis] = normal[axis] / volume
+        seen[count, 12], seen[count, 13], seen[count, 14], seen[count, 15] = left, right, top, bottom
+        faces[count] = f
+        count += 1
+    return seen[:count], faces[:count]
 
 
 @compiled
@@ -292,37 +306,38 @@ def _try(seen, candidates, x, y, faces, closeness):  # pragma: no cover
 
 @compiled
 def _shade(
-    seen, x, y, nodes, bounds, sizes,
+    seen, faces, x, y, nodes, bounds, sizes, wanted,
     uv, shade, texels_per_metre, texture, texels, texture_start, texture_size, background,
 ):  # fmt: skip  # pragma: no cover
-    """Mean over the samples of a pixel of shade times texture, [blocks, pixels, C].
+    """Mean over the samples of a wanted pixel of shade times texture, [blocks, pixels, C].
 
     A step is taken for all places of a block before the next one, so that it becomes vector instructions.
     """
     channels, pixels = texels.shape[1], sizes.shape[1]
     picture = np.full((len(x), pixels, channels), np.float32(background))
-    faces, closeness = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    hit, closeness = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
     px, py, face = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     pixel, share = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
     s, t, light = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty((channels, BLOCK), np.float32)
     start, side, blend = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.float32)
     value, coarser = np.empty((channels, BLOCK), np.float32), np.empty(BLOCK, np.float32)
     lists, lengths = _all(seen, nodes)
-    node, block = _next(seen, x, y, nodes, bounds, 0, lists, lengths, faces, closeness)
+    node, block = _next(seen, x, y, nodes, bounds, 0, lists, lengths, hit, closeness)
     while block >= 0:
-        count = _places(x[block], y[block], faces, pixels, px, py, face, pixel, share)
+        count = _places(x[block], y[block], hit, wanted[block], px, py, face, pixel, share)
         blends = False
         end = 0
         while end < count:
-            begin, f = end, face[end]
-            while end < count and face[end] == f:
+            begin, h = end, face[end]
+            while end < count and face[end] == h:
                 end += 1
+            f = faces[h]
             first, finest, last = texture_start[texture[f]], texture_size[texture[f]], -1
             at, size, part = first, finest, ZERO
             for k in range(begin, end):
-                a = seen[f, 0] * px[k] + seen[f, 1] * py[k] + seen[f, 2]
-                b = seen[f, 3] * px[k] + seen[f, 4] * py[k] + seen[f, 5]
-                c = seen[f, 6] * px[k] + seen[f, 7] * py[k] + seen[f, 8]
+                a = seen[h, 0] * px[k] + seen[h, 1] * py[k] + seen[h, 2]
+                b = seen[h, 3] * px[k] + seen[h, 4] * py[k] + seen[h, 5]
+                c = seen[h, 6] * px[k] + seen[h, 7] * py[k] + seen[h, 8]
                 scale = ONE / (a + b + c)
                 a, b, c = a * scale, b * scale, c * scale
                 s[k] = a * uv[f, 0, 0] + b * uv[f, 1, 0] + c * uv[f, 2, 0]
@@ -331,8 +346,8 @@ def _shade(
                     light[channel, k] = a * shade[f, 0, channel] + b * shade[f, 1, channel] + c * shade[f, 2, channel]
                 if pixel[k] != last:
                     last = pixel[k]
-                    near = seen[f, 9] * px[k] + seen[f, 10] * py[k] + seen[f, 11]
-                    footprint = min(sizes[block, last] * texels_per_metre[f] / near, np.float32(finest // 2))
+                    near = seen[h, 9] * px[k] + seen[h, 10] * py[k] + seen[h, 11]
+                    footprint = min(sizes[block, last] * texels_per_metre[f] / near, np.float32(finest))
                     level = np.log2(footprint) if footprint > ONE else ZERO
                     size = finest >> np.intp(level)
                     at, part = first + 4 * (finest * finest - size * size) // 3, level - np.float32(np.intp(level))
@@ -353,21 +368,23 @@ def _shade(
             for k in range(count):
                 change = share[k] * (light[channel, k] * value[channel, k] - np.float32(background))
                 picture[block, pixel[k], channel] += change
-        node, block = _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness)
+        node, block = _next(seen, x, y, nodes, bounds, node, lists, lengths, hit, closeness)
     return picture
 
 
 @compiled
-def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cover
+def _places(x, y, hit, wanted, px, py, face, pixel, share):  # pragma: no cover
     """Where a block takes brightness from, in which triangle, for which pixel and by which share; counts these places.
 
     One place for every group of samples that see the same triangle, else one for each of the samples.
     """
-    samples = BLOCK // pixels
+    samples = BLOCK // len(wanted)
     count = 0
     for first in range(0, BLOCK, GROUP):
-        f = faces[first]
-        if faces[first + 1] == f and faces[first + 2] == f and faces[first + 3] == f:
+        if not wanted[first // samples]:
+            continue
+        f = hit[first]
+        if hit[first + 1] == f and hit[first + 2] == f and hit[first + 3] == f:
             if f >= 0:
                 px[count] = (x[first] + x[first + 1] + x[first + 2] + x[first + 3]) / np.float32(GROUP)
                 py[count] = (y[first] + y[first + 1] + y[first + 2] + y[first + 3]) / np.float32(GROUP)
@@ -375,8 +392,8 @@ def _places(x, y, faces, pixels, px, py, face, pixel, share):  # pragma: no cove
                 count += 1
             continue
         for k in range(first, first + GROUP):
-            if faces[k] >= 0:
-                px[count], py[count], face[count], pixel[count] = x[k], y[k], faces[k], first // samples
+            if hit[k] >= 0:
+                px[count], py[count], face[count], pixel[count] = x[k], y[k], hit[k], first // samples
                 share[count] = ONE / np.float32(samples)
                 count += 1
     return count
