@@ -63,6 +63,32 @@ FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/moca
 SENSOR_SIZE = (1280, 720)
 """Width and height of the event cameras in pixels."""
 
+PUBLISHED_EVENT_CAMERA = Camera(
+    *SENSOR_SIZE,
+    *(1049.5830934616608, 1049.4229746040553, 634.7184038833433, 263.46974530961836),
+    (-0.11519655713574485, -0.06222183183004903, 0.21682612342850954, -0.23528623774744806),
+    "fisheye",
+)
+PUBLISHED_FRAME_CAMERA = Camera(
+    *(1024, 1024),
+    *(747.3121949097032, 747.1524375957724, 490.8606682225008, 505.2373814853779),
+    (0.019702988705266412, 0.0019647288278805426, 0.0020858202586604944, -0.0009536922337319427),
+    "fisheye",
+)
+PUBLISHED_EXTRINSICS = np.array(
+    [
+        [0.9996531471970287, 0.016267207253101275, 0.020711428421532566, 0.004961248261481997],
+        [-0.016224659683973887, 0.9998659054721688, -0.0022206963906204855, -0.044440526824174015],
+        [-0.02074477566075011, 0.0018838902581444984, 0.9997830290819506, -0.010716232401772177],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Pose of the left frame camera in the axes of the left event camera, metres; these three are of camera-calibrationA,
+with which mocap-desk and mocap-desk2 were recorded."""
+
+POSES_PER_SECOND = 120
+"""Of the motion capture."""
+
 SEQUENCES = {
     "A": ("loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"),
     "B": (
@@ -81,7 +107,7 @@ SHORTEST_STEP = 100_000
 """Nanoseconds between frames or poses."""
 
 LONGEST_GAP = 200_000_000
-"""Nanoseconds between poses, of which there are 120 a second, that interpolation may bridge."""
+"""Nanoseconds between poses that interpolation may bridge."""
 
 LENS_STEP = 16
 """Pixels between those at which it is checked that a lens can be."""

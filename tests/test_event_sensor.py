@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from scipy.optimize import brentq
 from scipy.stats import kstest
 
 from enerf_ns.dataparsers.recording import Events, RecordingError
-from enerf_ns.simulator.event_sensor import CUT_JITTER, READOUT_QUEUE, EventSensor, SensorSettings
+from enerf_ns.simulator.event_sensor import CUT_JITTER, READOUT_QUEUE, EventSensor, PartialPicture, SensorSettings
 
 EPS = 0.001
 MS, SECOND = 10**6, 10**9
@@ -491,6 +493,110 @@ def test_everything_together_is_what_a_slow_loop_finds():
     np.testing.assert_allclose(events.t, t, rtol=0, atol=1)
 
 
+def seen_between(rng: np.random.Generator, start: int, end: int, size: int) -> list[tuple[int, np.ndarray]]:
+    """Three times between two pictures, and the pixels that are seen then, in any order."""
+    times = np.sort(rng.choice(np.arange(start + 1, end), 3, replace=False))
+    return [(int(time), rng.permutation(size)[: rng.integers(size)]) for time in times]
+
+
+@pytest.mark.parametrize(
+    "other_settings",
+    [
+        {},
+        dict(refractory_period=700_000),
+        dict(leak_rate=60.0),
+        dict(cutoff_frequency=120.0),
+        dict(refractory_period=300_000, leak_rate=60.0, cutoff_frequency=200.0),
+    ],
+    ids=lambda settings: "-".join(settings) or "ideal",
+)
+def test_a_pixel_that_is_seen_between_pictures_fires_as_if_it_were_alone(other_settings):
+    """As a sensor of this pixel alone, of which whole pictures are taken at the times at which it is seen."""
+    shape, size, rng = (4, 6), 24, np.random.default_rng(3)
+    settings: dict[str, Any] = dict(contrast_thresholds=(0.13, 0.19), **other_settings)
+    times = np.arange(25) * MS + 77
+    pictures = np.exp(wander(shape, 25, seed=4)) - EPS
+    sensor = EventSensor(SensorSettings(**settings), pictures[0], int(times[0]))
+    histories = [[(int(times[0]), float(value))] for value in pictures[0].ravel()]
+    pieces = []
+    for k in range(1, 25):
+        before = []
+        for time, pixels in seen_between(rng, int(times[k - 1]), int(times[k]), size):
+            values = np.exp(rng.uniform(-3, 0, len(pixels))) - EPS
+            before.append(PartialPicture(time, pixels, values))
+            for pixel, value in zip(pixels.tolist(), values.tolist(), strict=True):
+                histories[pixel].append((time, value))
+        for history, value in zip(histories, pictures[k].ravel().tolist(), strict=True):
+            history.append((int(times[k]), value))
+        pieces.append(sensor.advance(pictures[k], int(times[k]), before))
+        assert (times[k - 1] < pieces[-1].t).all() and (pieces[-1].t <= times[k]).all()
+    events = joined([*pieces, sensor.finish()])
+
+    expected = []
+    for pixel, history in enumerate(histories):
+        (start, first), *others = history
+        alone = EventSensor(SensorSettings(**settings), np.array([[first]]), start)
+        own = joined([alone.advance(np.array([[value]]), time) for time, value in others])
+        expected += [(t, pixel, p) for t, p in zip(own.t.tolist(), own.p.tolist(), strict=True)]
+    found = np.stack([events.t, events.y * shape[1] + events.x, events.p], axis=1)
+    np.testing.assert_array_equal(found, sorted(expected))
+    assert len(found) > 200
+
+
+def test_events_of_one_time_are_in_the_order_of_pixels_also_if_some_were_seen_in_between():
+    first, last = np.full((2, 3), math.exp(-2.0)) - EPS, np.full((2, 3), math.exp(-1.5)) - EPS
+    sensor = EventSensor(SensorSettings(contrast_thresholds=(0.25, 0.25)), first, 0)
+    before = [PartialPicture(500, np.array([4, 1]), np.full(2, math.exp(-1.75)) - EPS)]
+    events = sensor.advance(last, 1000, before)
+    np.testing.assert_array_equal(events.t, np.repeat([500, 1000], 6))
+    np.testing.assert_array_equal(events.y * 3 + events.x, np.tile(np.arange(6), 2))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        dict(threshold_spread=0.1),
+        dict(timestamp_jitter=400_000.0),
+        dict(shot_noise_rate=150.0, refractory_period=400_000),
+        dict(hot_pixels=0.3, hot_pixel_rate=900.0, leak_rate=30.0),
+        {**EVERYTHING, "cutoff_frequency": 0.0},
+    ],
+    ids=["spread", "jitter", "shot noise", "hot pixels", "everything"],
+)
+def test_what_lies_on_the_line_between_two_pictures_changes_nothing(settings):
+    shape, size, rng = (6, 8), 48, np.random.default_rng(7)
+    levels, times = wander(shape, 20, seed=2), np.arange(20) * 5 * MS + 31
+    whole = fire(levels, times.tolist(), **settings)
+    pictures = np.exp(levels) - EPS
+    sensor = EventSensor(SensorSettings(**settings), pictures[0], int(times[0]))
+    pieces = []
+    for k in range(1, 20):
+        before = []
+        for time, pixels in seen_between(rng, int(times[k - 1]), int(times[k]), size):
+            share = (time - times[k - 1]) / (times[k] - times[k - 1])
+            line = levels[k - 1] + share * (levels[k] - levels[k - 1])
+            before.append(PartialPicture(time, pixels, np.exp(line.ravel()[pixels]) - EPS))
+        pieces.append(sensor.advance(pictures[k], int(times[k]), before))
+    assert_same(joined([*pieces, sensor.finish()]), whole)
+    assert len(whole) > 500
+
+
+@pytest.mark.parametrize("time", [-5, 0, 1000, 1001])
+def test_pixels_outside_the_time_between_two_pictures_are_refused(time):
+    sensor = EventSensor(SensorSettings(), np.ones((3, 4)), 0)
+    before = [PartialPicture(time, np.array([2]), np.ones(1))]
+    with pytest.raises(RecordingError, match=f"^Pixels at {time} ns are not between pictures at 0 ns and 1000 ns\\.$"):
+        sensor.advance(np.ones((3, 4)), 1000, before)
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
+def test_brightness_that_no_pixel_has_is_refused_between_pictures_too(value):
+    sensor = EventSensor(SensorSettings(), np.ones((3, 4)), 0)
+    before = [PartialPicture(30, np.array([11, 6, 2]), np.array([1.0, value, 1.0]))]
+    with pytest.raises(RecordingError, match=rf"^The picture at 30 ns is {value} at x = 2, y = 1, but"):
+        sensor.advance(np.ones((3, 4)), 1000, before)
+
+
 def split_mix(key: int, pixel: int, number: int) -> int:
     bits = (key + ((pixel << 32) + number + 1) * 0x9E3779B97F4A7C15) % 2**64
     bits = ((bits ^ bits >> 30) * 0xBF58476D1CE4E5B9) % 2**64
@@ -627,3 +733,17 @@ def test_pictures_that_do_not_follow_are_refused():
         sensor.advance(np.ones((4, 3)), 60)
     with pytest.raises(RecordingError, match=r"^The picture at 50 ns must be later than the last one, at 50 ns\.$"):
         sensor.advance(np.ones((3, 4)), 50)
+
+
+def test_the_lines_in_the_readme():
+    """A pixel fires once a threshold of every rise and fall, but for the last one begun before each turn."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    (lines,) = [lines for lines in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "adaptive_renders" in lines]
+    printed: list[tuple[Any, ...]] = []
+    exec(lines, {"print": lambda *columns: printed.append(columns)})
+    assert [columns[0] for columns in printed] == list(range(5_000_000, 100_000_001, 5_000_000))
+    phase = np.arange(160) / 8 - np.linspace(0, 10, 100_001)[:, None]
+    steps = np.diff(np.log(0.001 + 0.5 + 0.4 * np.sin(phase)), axis=0)
+    turns = np.count_nonzero(np.diff(np.sign(steps), axis=0))
+    thresholds, count = np.abs(steps).sum() / 0.2, sum(columns[1] for columns in printed) / 120
+    assert thresholds - turns - 160 < count < thresholds

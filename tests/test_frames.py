@@ -149,7 +149,7 @@ def test_noise_is_of_the_seed_the_frame_and_whether_it_is_blurred():
     brightness = np.full((20, 20, 3), 0.5)
 
     def noisy(seed: int = 1, number: int = 4, blurred: bool = False) -> np.ndarray:
-        return develop(brightness, FrameSettings(read_noise=3.0, shot_noise=500.0, seed=seed), number, blurred)
+        return develop(brightness, FrameSettings(read_noise=3.0, shot_noise=500.0), number, blurred, seed)
 
     np.testing.assert_array_equal(noisy(), noisy())
     assert not any((other == noisy()).all() for other in (noisy(seed=2), noisy(number=5), noisy(blurred=True)))
@@ -163,7 +163,6 @@ def test_noise_is_of_the_seed_the_frame_and_whether_it_is_blurred():
         (dict(saturation=float("nan")), "saturation of frames is nan"),
         (dict(read_noise=-1.0), "read noise of frames is -1, but grey levels from 0 on"),
         (dict(shot_noise=float("inf")), "shot noise of frames is inf, but electrons from 0 on"),
-        (dict(seed=-1), "seed of frames is -1, but a whole number from 0 on"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict, message: str):

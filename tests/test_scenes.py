@@ -361,6 +361,20 @@ def test_parts_stand_where_the_scene_file_puts_them(tmp_path):
     np.testing.assert_allclose(scene.texels[scene.texture_start[0]], 0.9)
 
 
+def test_an_inward_part_looks_inwards_and_light_falls_on_its_inside(tmp_path):
+    box = {"shape": "box", "size": [4, 4, 4], "texture": "plain", "brightness": [1, 1]}
+    about = {"camera": [0, 0, 0], "target": [0, 1, 0], "light": [0, 0, 1]}
+    volumes, floors = [], []
+    for inward in (False, True):
+        path = tmp_path / f"{inward}.json"
+        path.write_text(json.dumps({"parts": [{**box, "inward": inward}], **about}))
+        scene, _ = load(path)
+        volumes.append(np.linalg.det(scene.triangles).sum() / 6)
+        floors.append(scene.shade[(scene.triangles[..., 2] < -1.9).all(1)])
+    np.testing.assert_allclose(volumes, [64, -64], rtol=1e-6)
+    assert (floors[1] > 0.99).all() and (floors[0] < 0.71).all()
+
+
 def test_a_scene_file_without_a_camera_is_looked_at_from_above_and_all_is_seen(tmp_path):
     parts = ({"shape": "box", "position": [x, y, 0.5]} for x in (-2, 2) for y in (3, 7))
     scene, _ = load(write_scene(tmp_path, *parts))

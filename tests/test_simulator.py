@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.recording import RecordingError, read_recording
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.scripts.simulate import PUBLISHED_RIGS, Simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.sampling import render_times
 from enerf_ns.simulator.scenes import SCENES
-from enerf_ns.simulator.trajectories import MOTIONS, look_at
+from enerf_ns.simulator.trajectories import MOTIONS, look_at, sampled
 
 WIDTH, HEIGHT = 48, 36
 SHORT: dict[str, Any] = dict(duration=0.3, num_frames=12, width=WIDTH, height=HEIGHT)
@@ -54,28 +52,6 @@ def test_shake_moves_sideways_and_in_height_and_keeps_looking_at_the_target():
 def test_look_at_is_upright_with_opencv_axes():
     rotation = look_at(np.array([1.0, 2, 3]), np.array([1.0, 5, 3])).as_matrix()
     np.testing.assert_allclose(rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
-
-
-def test_no_pixel_moves_further_than_asked_between_two_renders():
-    made = SCENES["shapes"](np.random.default_rng(0))
-    camera = camera_of(WIDTH, HEIGHT, 40.0)
-    renderer = Renderer(made, camera)
-    trajectory = MOTIONS["shake"](2 * 10**8, made.camera, made.target, np.random.default_rng(1))
-    stops = np.array([0, 12_345_678, 2 * 10**8])
-
-    def depth(time: int) -> np.ndarray:
-        return renderer.depth(trajectory.poses(torch.tensor(time)).numpy())
-
-    times = render_times(camera, trajectory, depth, stops, 0.5)
-    assert np.isin(stops, times).all() and (np.diff(times) > 0).all()
-    poses = trajectory.poses(torch.from_numpy(times)).numpy()
-    rays = camera.pixel_directions().reshape(-1, 3)
-    furthest = []
-    for pose, following in pairwise(poses):
-        world = rays * renderer.depth(pose).reshape(-1, 1) @ pose[:, :3].T + pose[:, 3]
-        seen = (world - following[:, 3]) @ following[:, :3]
-        furthest.append(np.linalg.norm(40 * (seen / seen[:, 2:] - rays), axis=1).max())
-    assert 0.4 < max(furthest) < 0.55
 
 
 @pytest.fixture(scope="module")
@@ -204,6 +180,20 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
         (dict(layout="tum_vie"), "1280 x 720"),
         (dict(cameras=Path("nowhere.json"), width=None, height=None), "nowhere.json is missing"),
         (dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),
+        (dict(width=30000, height=30000), "30000 x 30000 pixels is too large"),
+        (dict(num_frames=10**9, exposure_ms=0.0), "0.3 s have no room for 1000000000 frames"),
+        (dict(duration=1e-4), "--duration is 0.0001, but must be"),
+        (dict(output_dir=Path("/dev/null/new")), "/dev/null/new cannot be made a folder"),
+        (dict(layout="eds"), "--width changes nothing in the layout eds without --cameras"),
+        (dict(cameras=Path("nowhere.json")), "--width changes nothing beside --cameras"),
+        (dict(motion="shake", key_frames=Path("keys.txt")), "--motion changes nothing beside --key-frames"),
+        (dict(trajectory=Path("a"), key_frames=Path("b")), "--trajectory changes nothing beside --key-frames"),
+        (dict(motion="spiral", trajectory=Path("a")), "--motion changes nothing beside --trajectory"),
+        (dict(trajectory_unit="us"), "--trajectory-unit changes nothing unless --trajectory is a text file"),
+        (dict(stamps=Path("a")), "--stamps changes nothing without a folder of images or a video"),
+        (dict(gamma=False), "--no-gamma changes nothing without a folder of images or a video"),
+        (dict(scene="a.mp4", layout="event_recording"), "--width changes nothing for pictures"),
+        (dict(scene=None, from_run=Path("a"), motion="shake"), "--motion changes nothing for a trained run"),
     ],
 )
 def test_settings_that_make_no_recording_are_refused(tmp_path, wrong, sentence):
@@ -262,16 +252,60 @@ def test_a_video_of_pictures_makes_events(tmp_path):
     assert len(x) == 12 * 16 * math.floor(change / 0.25) and (p > 0).all()
 
 
+def test_the_published_cameras_of_tum_vie_are_those_of_its_calibration(shared_data):
+    stated = json.loads((shared_data / "tum_vie/camera-calibrationA.json").read_text())["value0"]
+    event_camera, frame_camera, event_from_frame = PUBLISHED_RIGS["tum_vie"]
+    poses = []
+    for index, camera in ((2, event_camera), (0, frame_camera)):
+        lens = stated["intrinsics"][index]["intrinsics"]
+        assert [camera.width, camera.height] == stated["resolution"][index] and camera.model == "fisheye"
+        assert (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion) == tuple(lens.values())
+        mount, pose = stated["T_imu_cam"][index], np.eye(4)
+        pose[:3, :3] = Rotation.from_quat([mount[f"q{axis}"] for axis in "xyzw"]).as_matrix()
+        pose[:3, 3] = [mount[f"p{axis}"] for axis in "xyz"]
+        poses.append(pose)
+    np.testing.assert_allclose(poses[0] @ event_from_frame, poses[1], atol=1e-12)
+
+
+def test_poses_of_tum_vie_are_as_many_as_those_of_its_motion_capture():
+    trajectory = MOTIONS["shake"](123_456_789, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
+    found = sampled(trajectory, 120)
+    assert abs(1e9 / np.median(np.diff(found.times)) - 120) < 1 and (np.diff(found.times) > 4_000_000).all()
+    assert (found.start, found.end) == (0, 123_456_789) and (found.times[:-1] % 1000 == 0).all()
+    times = torch.from_numpy(found.times)
+    torch.testing.assert_close(found.poses(times), trajectory.poses(times), atol=1e-9, rtol=0)
+    assert sampled(found, 120) is found
+
+
 @pytest.mark.slow
-def test_twice_as_many_renders_make_the_same_events_but_for_a_few(tmp_path):
-    """Both rebuild the same brightness, so that a pixel's net count differs by one at most; extrema between renders
-    cost the coarser one some pairs of an on and an off event."""
-    counts, net = [], []
-    for name, displacement in (("coarse", 0.5), ("fine", 0.25)):
-        Simulate(tmp_path / name, "shapes", max_displacement=displacement, **SHORT).main()
-        x, y, _, p = np.concatenate([np.load(file) for file in sorted((tmp_path / name / "events").glob("*"))]).T
-        counts.append(len(x))
-        net.append(np.zeros((HEIGHT, WIDTH)))
-        np.add.at(net[-1], (y, x), p)
-    assert np.abs(net[0] - net[1]).max() <= 1
-    assert 0.97 < counts[0] / counts[1] < 1.01
+@pytest.mark.parametrize("layout", ["eds", "tum_vie"])
+def test_layouts_of_data_sets_have_their_cameras_and_the_trajectory_that_was_rendered(tmp_path, layout):
+    Simulate(
+        tmp_path / "new", "carpet", layout=layout, motion="spiral", duration=0.02, num_frames=2, exposure_ms=2.0,
+        max_displacement=32.0, max_change=9.0,
+    ).main()  # fmt: skip
+    read = read_recording(tmp_path / "new")
+    event_camera, frame_camera, event_from_frame = PUBLISHED_RIGS[layout]
+    assert read.frames is not None and (read.camera, read.frames.camera) == (event_camera, frame_camera)
+    np.testing.assert_array_equal(read.frames.times, [5_000_000, 15_000_000])
+    scene_rng, motion_rng = np.random.default_rng(0).spawn(2)
+    scene = SCENES["carpet"](scene_rng)
+    trajectory = MOTIONS["spiral"](20_000_000, scene.camera, scene.target, motion_rng)
+    if layout == "tum_vie":
+        trajectory = sampled(trajectory, 120)
+    times = torch.linspace(0, 2e7, 50).long()
+    for found, expected in (
+        (read.trajectory, trajectory),
+        (read.frames.trajectory, trajectory.of_mounted(event_from_frame)),
+    ):
+        torch.testing.assert_close(found.poses(times), expected.poses(times), atol=1e-9, rtol=0)
+
+
+def test_thresholds_are_those_of_the_preset_unless_given(tmp_path):
+    for given, expected in ((None, (0.2, 0.2)), ((0.3, 0.4), (0.3, 0.4))):
+        folder = tmp_path / str(given)
+        Simulate(
+            folder, "spiral1", duration=0.1, num_frames=11, exposure_ms=2.0, width=32, height=24,
+            contrast_thresholds=given,
+        ).main()  # fmt: skip
+        assert read_recording(folder).contrast_thresholds == expected

@@ -162,8 +162,8 @@ def damage(path: Path) -> None:
         (lambda folder: [file.unlink() for file in folder.iterdir()], dict(frames_per_second=1.0), "holds no pictures"),
         (lambda folder: [file.unlink() for file in list(folder.iterdir())[1:]], dict(frames_per_second=1.0),
          "holds only one picture"),
-        (lambda _: None, {}, "needs either --fps or --stamps"),
-        (lambda _: None, dict(frames_per_second=1.0, stamps=Path("times.txt")), "needs either --fps or --stamps"),
+        (lambda _: None, {}, "needs either --frames-per-second or"),
+        (lambda _: None, dict(frames_per_second=1.0, stamps=Path("times.txt")), "needs either --frames-per-second or"),
         (lambda _: None, dict(frames_per_second=0.0), "has 0 frames per second"),
         (lambda _: None, dict(frames_per_second=math.nan), "has nan frames per second"),
         (lambda _: None, dict(frames_per_second=1e10), r"has 1e\+10 frames per second"),
@@ -260,7 +260,7 @@ def test_files_that_are_no_video_are_refused(tmp_path: Path, change, message: st
 
 
 def test_a_frame_rate_that_is_none_is_refused_for_a_video(tmp_path: Path):
-    with pytest.raises(RecordingError, match=r"has -1 frames per second, .* give it with --fps"):
+    with pytest.raises(RecordingError, match=r"has -1 frames per second, .* give it with --frames-per-second"):
         Video(write_video(tmp_path / "a.avi"), frames_per_second=-1.0)
 
 

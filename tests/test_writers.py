@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
+import multiprocessing
 import subprocess
+import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -280,16 +281,16 @@ def test_frames_in_colour(tmp_path: Path, layout: str):
 
 
 def test_frames_are_those_that_the_sensor_reads_out(tmp_path: Path):
-    settings = FrameSettings(saturation=0.7, read_noise=3.0, shot_noise=900.0, seed=5)
-    setup = setup_of("event_recording", frame_settings=settings)
+    settings = FrameSettings(saturation=0.7, read_noise=3.0, shot_noise=900.0)
+    setup = setup_of("event_recording", frame_settings=settings, seed=5)
     (tmp_path / "new").mkdir()
     with open_writer("event_recording", tmp_path / "new", setup) as writer:
         frame, depth = frame_of(setup, 0)
         sharp, blurred = writer.add_frame(frame, depth)
         writer.add_events(random_events(RGB))
     assert frame.blurred is not None and blurred is not None
-    np.testing.assert_array_equal(sharp, develop(frame.sharp, settings, 0, False))
-    np.testing.assert_array_equal(blurred, develop(frame.blurred, settings, 0, True))
+    np.testing.assert_array_equal(sharp, develop(frame.sharp, settings, 0, False, seed=5))
+    np.testing.assert_array_equal(blurred, develop(frame.blurred, settings, 0, True, seed=5))
     recording = read_recording(tmp_path / "new")
     assert recording.frames is not None and recording.blurred_frames is not None
     np.testing.assert_array_equal(load_image(recording.frames.filenames[0])[..., 0], sharp)
@@ -476,34 +477,31 @@ def test_an_interrupted_recording_holds_all_that_was_added(tmp_path: Path, layou
     assert json.loads((folder / "simulation.json").read_text())["finished"] is False
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a process that can be killed")
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_killed_process_leaves_what_it_wrote(tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 500)
-    setup, folder = setup_of(layout), tmp_path / "new"
+def write_and_wait(layout: str, folder: Path, written: Connection) -> None:
+    writers.EVENTS_AT_A_TIME = 500
+    setup = setup_of(layout)
     events = random_events(setup.event_camera)
+    writer = open_writer(layout, folder, setup)
+    for start in range(0, 3000, 300):
+        writer.add_events(part(events, start, start + 300))
+    for number in range(4):
+        writer.add_frame(*frame_of(setup, number))
+    written.send(True)
+    time.sleep(600)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_killed_process_leaves_what_it_wrote(tmp_path: Path, layout: str):
+    setup, folder = setup_of(layout), tmp_path / "new"
     folder.mkdir()
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            writer = open_writer(layout, folder, setup)
-            for start in range(0, 3000, 300):
-                writer.add_events(part(events, start, start + 300))
-            for number in range(4):
-                writer.add_frame(*frame_of(setup, number))
-            os.write(writing, b"written")
-            signal.pause()
-        finally:
-            os._exit(1)
-    os.close(writing)
-    assert os.read(reading, 7) == b"written"
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    os.close(reading)
-    num_events, num_frames = check_what_is_left(layout, folder, setup, events)
-    assert num_frames == 4
-    assert num_events == 3000
+    context = multiprocessing.get_context("spawn")
+    reading, writing = context.Pipe(duplex=False)
+    child = context.Process(target=write_and_wait, args=(layout, folder, writing))
+    child.start()
+    assert reading.poll(120) and reading.recv()
+    child.kill()
+    child.join()
+    assert check_what_is_left(layout, folder, setup, random_events(setup.event_camera)) == (3000, 4)
 
 
 @pytest.mark.parametrize("layout", ["eds", "tum_vie"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from typing import Annotated, Union  # tyro reads these annotations on Python 3.10
 
@@ -26,8 +27,12 @@ Command = Union[  # noqa: UP007
 def entrypoint() -> None:
     """Run the command line; a user's mistake ends it with one sentence."""
     warnings.filterwarnings("ignore", module="nerfstudio")
-    command = tyro.cli(Command, description="Radiance fields from event cameras.")
     try:
-        command.main()
+        tyro.cli(Command, description="Radiance fields from event cameras.").main()
     except RecordingError as error:
         raise SystemExit(f"enerf: {error}") from error
+    except MemoryError as error:
+        raise SystemExit("enerf: There is not enough memory for this; ask for less at a time.") from error
+    except KeyboardInterrupt as error:
+        print("enerf: Stopped.", file=sys.stderr)
+        raise SystemExit(130) from error

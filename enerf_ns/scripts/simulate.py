@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
 
@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers import eds
+from enerf_ns.dataparsers import eds, tum_vie
 from enerf_ns.dataparsers.calibration import Camera
 from enerf_ns.dataparsers.event_recording import read_cameras
 from enerf_ns.dataparsers.recording import Events, RecordingError
@@ -27,11 +27,12 @@ from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
 from enerf_ns.simulator.presets import PRESETS, SimulationPreset
 from enerf_ns.simulator.preview import Preview
 from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.sampling import Render, adaptive_renders, render_times
+from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, Render, adaptive_renders, render_times
 from enerf_ns.simulator.scene_files import load_scene
 from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
-from enerf_ns.simulator.trajectories import MOTIONS, from_file, key_frames
+from enerf_ns.simulator.trajectories import MOTIONS, from_file, key_frames, sampled
+from enerf_ns.simulator.views import check_view
 from enerf_ns.simulator.writers import Setup, Writer, open_writer
 
 CONSOLE = Console(width=120)
@@ -40,6 +41,15 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 
 SECONDS, NUM_FRAMES, EXPOSURE_MS, SIZE, FIELD_OF_VIEW = 1.0, 41, 20.0, (160, 120), 60.0
 """Of a recording for which neither a preset nor a flag states them."""
+
+MOST_PIXELS = 2**24
+"""Of a camera; rendering takes up to a kilobyte of memory for each."""
+
+PUBLISHED_RIGS = {
+    "eds": (eds.PUBLISHED_EVENT_CAMERA, eds.PUBLISHED_RGB_CAMERA, eds.PUBLISHED_EXTRINSICS),
+    "tum_vie": (tum_vie.PUBLISHED_EVENT_CAMERA, tum_vie.PUBLISHED_FRAME_CAMERA, tum_vie.PUBLISHED_EXTRINSICS),
+}
+"""Cameras of events and of frames, and the pose of the latter in the axes of the former, of layouts that have some."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +118,12 @@ class Simulate:
     """Text file with the times of the images of a folder in seconds, one a line."""
     gamma: bool = True
     """Take the images of a folder or a video for sRGB, not for linear brightness."""
-    max_displacement: float = 0.5
-    """Pixels that a point may move at most from one render to the next."""
-    max_change: float = 0.5
-    """How much log brightness may change from one render to the next before one more is made between them."""
+    contrast_thresholds: Optional[tuple[float, float]] = None  # noqa: UP045
+    """Change of log brightness that makes an on event, and an off event. None: as the preset, or 0.25 0.25."""
+    max_displacement: float = MAX_DISPLACEMENT
+    """Pixels that a point may move at most from one picture to the next that events are made of."""
+    max_change: float = MAX_CHANGE
+    """By how much a pixel's log brightness may change at most before it is rendered again, between pictures."""
     preview: bool = False
     """Write preview.mp4 too: frame, blurred frame, events and depth side by side."""
     sensor: Annotated[SensorSettings, tyro.conf.arg(name="")] = field(default_factory=SensorSettings)
@@ -124,10 +136,17 @@ class Simulate:
                 f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
             )
         self._check_flags()
+        thresholds = self.contrast_thresholds or (self._preset and self._preset.contrast_thresholds)
+        if thresholds:
+            self.sensor = replace(self.sensor, contrast_thresholds=thresholds)
         notes: list[str] = []
         view = self._view(notes)
         times, exposures = self._exposures(view)
-        sensor = EventSensor(self.sensor, self._seen(view.events.brightness(view.start), view.events), view.start)
+        first = view.events.brightness(view.start)
+        for flag, value in (("--color", self.color), ("--bayer-pattern", self.bayer_pattern)):
+            if value and first.ndim == 2:
+                notes.append(f"{flag} changes nothing, since {self.scene or self.from_run} is grey.")
+        sensor = EventSensor(self.sensor, self._seen(first, view.events), view.start)
         setup = Setup(
             event_camera=view.event_camera,
             frame_camera=view.frame_camera,
@@ -139,10 +158,16 @@ class Simulate:
             pixel_thresholds=sensor.contrast_thresholds if self.sensor.threshold_spread else None,
             refractory_period=self.sensor.refractory_period,
             bayer_pattern=self.bayer_pattern,
-            frame_settings=replace(self.frame, seed=self.sensor.seed),
+            frame_settings=self.frame,
+            seed=self.sensor.seed,
             settings=self._settings(),
         )
-        output_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            output_dir.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(
+                f"{output_dir} cannot be made a folder ({error.strerror}); give another --output-dir."
+            ) from error
         with ExitStack() as stack:
             stack.callback(_remove_if_empty, output_dir)
             writer = stack.enter_context(open_writer(self.layout, output_dir, setup))
@@ -151,6 +176,8 @@ class Simulate:
                 size = view.events.width, view.events.height
                 preview = stack.enter_context(Preview(output_dir / "preview.mp4", *size))
             self._record(view, exposures, sensor, writer, preview)
+        if not writer.num_events:
+            notes.append("There are no events, without which a recording cannot be read; let more change.")
         for note in [*notes, *writer.notes]:
             CONSOLE.print(f"note: {note}", highlight=False)
         CONSOLE.print(
@@ -162,7 +189,7 @@ class Simulate:
 
     def _check_flags(self) -> None:
         for flag, value, fine, expected in (
-            ("--duration", self.duration, lambda v: 0 < v < 1e6, "seconds above 0"),
+            ("--duration", self.duration, lambda v: 1e-3 <= v <= 1000, "seconds from 0.001 to 1000"),
             ("--num-frames", self.num_frames, lambda v: v > 0, "at least 1"),
             ("--exposure-ms", self.exposure_ms, lambda v: 0 <= v < np.inf, "milliseconds from 0 on"),
             ("--width", self.width, lambda v: 0 < v < 2**15, "pixels above 0"),
@@ -177,6 +204,40 @@ class Simulate:
                 raise RecordingError(f"{flag} is {value}, but must be {expected}.")
         if (self.scene is None) == (self.from_run is None):
             raise RecordingError("Give either what is to be seen, such as shapes or a mesh, or --from-run config.yml.")
+        self._check_use()
+
+    def _check_use(self) -> None:
+        """Refuses flags that would change nothing."""
+        poses_file = self.trajectory is not None and not self.trajectory.expanduser().is_dir()
+        sizes = ("--width", "--height", "--field-of-view")
+        rig = PUBLISHED_RIGS.get(self.layout)
+        own_rig = rig is not None and self.cameras is None and self.from_run is None and self._pictures is None
+        for applies, situation, useless in (
+            (self._pictures, "for pictures, which have their size and no poses",
+             ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement")),
+            (self._pictures is None, "without a folder of images or a video",
+             ("--frames-per-second", "--stamps", "--no-gamma")),
+            (self._pictures and self._pictures.is_file(), "for a video", ("--stamps",)),
+            (self.from_run, "for a trained run", ("--motion", "--cameras")),
+            (self.key_frames, "beside --key-frames", ("--motion", "--trajectory")),
+            (self.trajectory, "beside --trajectory", ("--motion",)),
+            (not poses_file, "unless --trajectory is a text file of poses", ("--trajectory-unit",)),
+            (self.cameras, "beside --cameras", sizes),
+            (own_rig, f"in the layout {self.layout} without --cameras, whose cameras are those of the data set "
+             f"({rig[0].width} x {rig[0].height} pixels)" if rig else "", sizes),
+        ):  # fmt: skip
+            for flag in useless:
+                name = flag.removeprefix("--no-").removeprefix("--").replace("-", "_")
+                if applies and getattr(self, name) != DEFAULTS[name]:
+                    raise RecordingError(f"{flag} changes nothing {situation}; leave it out.")
+
+    @property
+    def _pictures(self) -> Path | None:
+        """The folder of images or the video that is seen, if it is one."""
+        if self.scene is None or self.scene in PRESETS or self.scene in SCENES:
+            return None
+        path = Path(self.scene).expanduser()
+        return path if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES else None
 
     @property
     def _preset(self) -> SimulationPreset | None:
@@ -185,20 +246,20 @@ class Simulate:
     def _view(self, notes: list[str]) -> View:
         """What is looked at, by which cameras and from where."""
         end = None if self.duration is None else round(self.duration * 1e9)
-        path = None if self.scene is None else Path(self.scene).expanduser()
-        if path is not None and (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
-            return self._pictures_view(path, end)
+        if self._pictures is not None:
+            return self._pictures_view(self._pictures, end)
         if self.from_run is not None:
             trajectory = self._given_trajectory(notes)
             camera = self._pinhole() if self.width or self.height or self.field_of_view else None
             duration = end or round(SECONDS * 1e9)
             run = TrainedRun(self.from_run.expanduser().resolve(), trajectory, duration, camera)
-            return View(run, None, run.trajectory, run.camera, run.camera, np.eye(4), run.start, _until(run.end, end))
+            end = _until(str(self.trajectory or self.key_frames or self.from_run), run.end, end)
+            return View(run, None, run.trajectory, run.camera, run.camera, np.eye(4), run.start, end)
         assert self.scene is not None
         scene_rng, motion_rng = np.random.default_rng(self.sensor.seed).spawn(2)
         preset = self._preset
         name = preset.scene if preset else self.scene
-        scene = SCENES[name](scene_rng) if name in SCENES else load_scene(self._file(path), scene_rng, notes)
+        scene = SCENES[name](scene_rng) if name in SCENES else load_scene(self._file(), scene_rng, notes)
         if not (self.color or self.bayer_pattern):
             scene = scene.grey()
         trajectory = self._given_trajectory(notes)
@@ -209,13 +270,30 @@ class Simulate:
             else:
                 motion = MOTIONS[self.motion or "shake"]
                 trajectory = motion(round(seconds * 1e9), scene.camera, scene.target, motion_rng)
+        if self.layout == "tum_vie":
+            given = self.trajectory or self.key_frames
+            trajectory, original = sampled(trajectory, tum_vie.POSES_PER_SECOND), trajectory
+            if given and trajectory is not original:
+                notes.append(
+                    f"{given} is followed through {tum_vie.POSES_PER_SECOND} poses a second, as many as TUM-VIE has."
+                )
         event_camera, frame_camera, event_from_frame = self._read_cameras()
+        for camera in (event_camera, frame_camera):
+            if camera.width * camera.height > MOST_PIXELS:
+                raise RecordingError(
+                    f"A camera of {camera.width} x {camera.height} pixels is too large to be simulated; give one of at "
+                    f"most {MOST_PIXELS:,} pixels."
+                )
         events = RenderedScene(Renderer(scene, event_camera), trajectory)
         frames = None
         if frame_camera != event_camera or (event_from_frame != np.eye(4)).any():
             frames = RenderedScene(Renderer(scene, frame_camera), trajectory.of_mounted(event_from_frame))
+        end = _until(str(self.trajectory or self.key_frames), trajectory.end, end)
+        names = ("the event camera", "the frame camera") if frames else ("the camera",)
+        for what, source in zip(names, filter(None, (events, frames)), strict=True):
+            check_view(self.scene, what, source, trajectory.start, end, notes)
         cameras = event_camera, frame_camera, event_from_frame
-        return View(events, frames, trajectory, *cameras, trajectory.start, _until(trajectory.end, end))
+        return View(events, frames, trajectory, *cameras, trajectory.start, end)
 
     def _pictures_view(self, path: Path, end: int | None) -> View:
         if self.layout != "event_recording":
@@ -230,10 +308,12 @@ class Simulate:
         width, height = source.width, source.height
         focal_length = width / 2 / np.tan(np.radians((self.field_of_view or FIELD_OF_VIEW) / 2))
         camera = Camera(width, height, focal_length, focal_length, width / 2, height / 2)
-        return View(source, None, None, camera, camera, np.eye(4), source.start, _until(source.end, end))
+        return View(source, None, None, camera, camera, np.eye(4), source.start, _until(str(path), source.end, end))
 
-    def _file(self, path: Path | None) -> Path:
-        if path is None or not path.exists():
+    def _file(self) -> Path:
+        assert self.scene is not None
+        path = Path(self.scene).expanduser()
+        if not path.exists():
             raise RecordingError(
                 f"{self.scene} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file "
                 "or folder that exists; give one of these."
@@ -259,8 +339,8 @@ class Simulate:
         """Of events and of frames, and the pose of the latter in the axes of the former."""
         if self.cameras is not None:
             return read_cameras(self.cameras.expanduser())
-        if self.layout == "eds":
-            return eds.PUBLISHED_EVENT_CAMERA, eds.PUBLISHED_RGB_CAMERA, eds.PUBLISHED_EXTRINSICS
+        if self.layout in PUBLISHED_RIGS:
+            return PUBLISHED_RIGS[self.layout]
         camera = self._pinhole()
         return camera, camera, np.eye(4)
 
@@ -271,9 +351,14 @@ class Simulate:
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
             exposure_ms = preset.exposure_ms if preset else EXPOSURE_MS
-        length = view.end - view.start
+        exposure, length = round(exposure_ms * 500) * 2000, view.end - view.start
+        if count * 1000 > length or (count == 1 and exposure > length):
+            raise RecordingError(
+                f"{length * 1e-9:g} s have no room for {count} frame{'s' * (count > 1)} with exposures of "
+                f"{exposure * 1e-6:g} ms, since frames are at least 1 us apart; give less or a longer --duration."
+            )
         times = view.start + ((np.arange(count) + 0.5) * length / count).astype(np.int64) // 1000 * 1000
-        return times, Exposures(times, round(exposure_ms * 500) * 2000)
+        return times, Exposures(times, exposure)
 
     def _settings(self) -> dict[str, Any]:
         settings = asdict(self)
@@ -361,8 +446,16 @@ class Simulate:
         return picture if self.color or picture.ndim == 2 else luma(torch.from_numpy(picture)).numpy()
 
 
-def _until(end: int, wanted: int | None) -> int:
-    return end if wanted is None else min(end, wanted)
+DEFAULTS = {setting.name: setting.default for setting in fields(Simulate)}
+
+
+def _until(name: str, end: int, wanted: int | None) -> int:
+    """When the recording ends (ns), of what lasts until `end`."""
+    if wanted is not None and wanted > end:
+        raise RecordingError(
+            f"--duration is {wanted * 1e-9:g} s, but {name} lasts {end * 1e-9:.9g} s; give less or leave it out."
+        )
+    return end if wanted is None else wanted
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -29,6 +29,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
+import tyro
 from jaxtyping import Float, Int64
 
 from enerf_ns.compiled import compiled
@@ -55,7 +56,7 @@ class SensorSettings:
         RecordingError: A setting is out of its range.
     """
 
-    contrast_thresholds: tuple[float, float] = (0.25, 0.25)
+    contrast_thresholds: tyro.conf.Suppress[tuple[float, float]] = (0.25, 0.25)
     """Change of log brightness that makes an on event, and an off event."""
     threshold_spread: float = 0.0
     """Standard deviation of the thresholds from pixel to pixel, as a share of the threshold; they stay as they are."""
@@ -224,11 +225,11 @@ class EventSensor:
             raise RecordingError(f"The picture at {time} ns must be later than the last one, at {self.time} ns.")
         since = np.full(brightness.size, self.time)
         parts = [self._held]
+        last = self.time
         for picture in before:
-            if not self.time < picture.time < time:
-                raise RecordingError(
-                    f"Pixels at {picture.time} ns are not between pictures at {self.time} ns and {time} ns."
-                )
+            if not last < picture.time < time:
+                raise RecordingError(f"Pixels at {picture.time} ns are not between {last} ns and {time} ns.")
+            last = picture.time
             parts.append(self._see(picture.pixels, since, picture.brightness, picture.time))
         parts.append(self._see(self._all, since, brightness, time))
         self.time = time

@@ -12,7 +12,7 @@ from enerf_ns.dataparsers.recording import RecordingError
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """The sensor of the frames. Its noise is drawn anew for each frame, and the same for one seed.
+    """The sensor of the frames.
 
     Raises:
         RecordingError: A setting is out of its range.
@@ -26,15 +26,12 @@ class FrameSettings:
     """Electrons in a pixel that is white, its full well: the fewer, the more noise; 0 for no noise."""
     hdr: bool = False
     """Keep the linear brightness of frames as well, without noise and saturation."""
-    seed: int = 0
-    """Draws the noise; from 0 on."""
 
     def __post_init__(self) -> None:
         for name, fine, expected in (
             ("saturation", 0 < self.saturation < np.inf, "a brightness above 0"),
             ("read noise", 0 <= self.read_noise < np.inf, "grey levels from 0 on"),
             ("shot noise", 0 <= self.shot_noise < np.inf, "electrons from 0 on"),
-            ("seed", self.seed >= 0, "a whole number from 0 on"),
         ):
             if not fine:
                 value = getattr(self, name.replace(" ", "_"))
@@ -133,7 +130,11 @@ class Exposures:
 
 
 def develop(
-    brightness: Float[np.ndarray, "height width *channels"], settings: FrameSettings, number: int, blurred: bool
+    brightness: Float[np.ndarray, "height width *channels"],
+    settings: FrameSettings,
+    number: int,
+    blurred: bool,
+    seed: int = 0,
 ) -> UInt8[np.ndarray, "height width *channels"]:
     """The grey levels that the sensor reads out: 255 from the saturation on, rounded to the nearest.
 
@@ -143,10 +144,11 @@ def develop(
     Args:
         brightness: Linear, from 0 on.
         settings: Of the sensor.
-        number: Of the frame, from 0, which draws the noise together with the seed and `blurred`.
+        number: Of the frame, from 0.
         blurred: Whether it is the blurred or the sharp frame of this number.
+        seed: Draws the noise, together with the number and `blurred`; from 0 on.
     """
-    rng = np.random.default_rng([settings.seed, number, int(blurred)])
+    rng = np.random.default_rng([seed, number, int(blurred)])
     level = np.asarray(brightness, np.float64) / settings.saturation
     if settings.shot_noise:
         level = rng.poisson(level * settings.shot_noise) / settings.shot_noise

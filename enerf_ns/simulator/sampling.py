@@ -31,9 +31,9 @@ MAX_DISPLACEMENT = 0.5
 MAX_CHANGE = 0.3
 """Of log brightness, from one time at which a pixel is rendered to the next."""
 
-MOST_HALVINGS = 2
-"""Of an interval. A pixel is the mean of 16 samples, so that an edge passes it in as many steps: a third halving of
-half a pixel of motion would show these, and changed the number of events by less than 0.3 %."""
+MOST_HALVINGS = 3
+"""Of an interval. A pixel is the mean of 16 samples, so that an edge passes it in as many steps: from half a pixel of
+motion between pictures three halvings lead to that of one step, and more would show the steps alone."""
 
 
 class Render(NamedTuple):
@@ -55,7 +55,7 @@ def render_times(
     depth: Callable[[int], Float32[np.ndarray, "height width"]],
     stops: Int64[np.ndarray, " stops"],
     max_displacement: float = MAX_DISPLACEMENT,
-    threads: int = 2,
+    threads: int | None = None,
 ) -> Int64[np.ndarray, " times"]:
     """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
 
@@ -68,7 +68,7 @@ def render_times(
         depth: z-depth that the camera sees at a time (ns), 0 where it sees nothing. Called from several threads.
         stops: Nanoseconds, strictly increasing; times to render at in any case.
         max_displacement: Pixels.
-        threads: How many measure displacements.
+        threads: How many measure displacements. None: as many as PyTorch uses.
 
     Returns:
         Nanoseconds, strictly increasing, from the first stop to the last, all stops among them.
@@ -98,7 +98,7 @@ def render_times(
         moved = np.einsum("nij,snj->sni", pixels_per_unit[seen], np.diff(directions, axis=0))
         return np.linalg.norm(moved, axis=-1).max(axis=1, initial=0)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads or torch.get_num_threads()) as pool:
         parts = list(pool.map(displacements, range(0, count - 1, STEPS_PER_DEPTH)))
     travelled = np.cumsum(np.concatenate([[0], *parts]))
     rendered = [stops]
@@ -113,7 +113,7 @@ def adaptive_renders(
     times: Int64[np.ndarray, " times"],
     max_change: float = MAX_CHANGE,
     log_eps: float = 0.001,
-    threads: int = 2,
+    threads: int | None = None,
 ) -> Iterator[Render]:
     """Pictures at the given times, and between them the pixels of which they do not tell enough.
 
@@ -121,21 +121,23 @@ def adaptive_renders(
     by no more than an eighth of the square of that from the straight line that events are made from: by 0.011 for 0.3.
     So far strays the logarithm of a brightness that changes linearly by `max_change`; of others the error is estimated
     by second differences, which also tell where a pixel becomes darker and brighter again. Where either is more, the
-    interval is halved, at most `MOST_HALVINGS` times.
+    interval is halved, at most `MOST_HALVINGS` times. The first and the last interval have a picture on one side alone
+    to take second differences with.
 
     What is rendered depends on brightness alone. A few pictures are rendered ahead; an exception of a render is raised
-    in its turn.
+    instead of its picture or of the one before, to which it is a neighbour.
 
     Args:
         brightness: As of `sources.Source`. Called from several threads.
         times: Nanoseconds, strictly increasing; whole pictures are rendered at these and no others.
         max_change: Of the natural logarithm of log_eps + brightness; infinite: nothing is rendered between pictures.
         log_eps: Above 0.
-        threads: How many render at once.
+        threads: How many render at once. None: as many as PyTorch uses.
 
     Yields:
         In the order of time.
     """
+    threads = threads or torch.get_num_threads()
     max_error = max_change**2 / 8
     pictures: dict[int, Future[np.ndarray]] = {}
     partial_pictures: dict[int, Future[list[PartialPicture]]] = {}

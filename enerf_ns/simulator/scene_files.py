@@ -26,6 +26,7 @@ Scene file (.json), paths relative to its folder; everything but `parts` and `sh
                 longest side of its bounding box, without it the mesh is as large as it is.
     position    of the origin of the part, for box, ball and plane their middle, metres [0, 0, 0].
     rotation    degrees about the axes x, then y, then z of the world [0, 0, 0], about the origin of the part.
+    inward      whether its faces look inwards, as those of a room [false]; a camera may only be inside of such a part.
     texture     plain, clouds, mosaic, bricks, lines, text, wood, roads, moon, page, or an image file, which is
                 stretched once over each side of the part, as page is (plain; a mesh: its own materials).
     brightness  of the texture's darkest and brightest value ([0.15, 0.9]; of images, roads and moon [0, 1]).
@@ -115,7 +116,7 @@ class Piece:
     """Triangles with one texture, before light falls on them."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
-    """Corners in metres."""
+    """Corners in metres, counter-clockwise as seen from outside."""
     normals: Float[np.ndarray, "faces 3 3"]
     """Unit vectors at the corners, outwards."""
     uv: Float[np.ndarray, "faces 3 2"]
@@ -126,14 +127,19 @@ class Piece:
     """As in `Surface`."""
 
     def moved(self, matrix: Float[np.ndarray, "4 4"]) -> Piece:
-        """In other axes, which may be stretched or mirrored."""
+        """In other axes, which may be stretched or mirrored; corners stay counter-clockwise as seen from outside."""
         normals = self.normals @ np.linalg.pinv(matrix[:3, :3])
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
-        return replace(
-            self,
-            triangles=self.triangles @ matrix[:3, :3].T + matrix[:3, 3],
-            normals=np.divide(normals, length, out=np.zeros_like(normals), where=length > 0),
-        )
+        normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+        triangles = self.triangles @ matrix[:3, :3].T + matrix[:3, 3]
+        if np.linalg.det(matrix[:3, :3]) >= 0:
+            return replace(self, triangles=triangles, normals=normals)
+        return replace(self, triangles=triangles, normals=-normals).inside_out()
+
+    def inside_out(self) -> Piece:
+        """Its inside becomes its outside."""
+        of_corners = self.triangles, -self.normals, self.uv, self.colour
+        return Piece(*(array[:, ::-1] for array in of_corners), self.image)
 
 
 def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
@@ -452,7 +458,7 @@ def _read_scene_file(path: Path, rng: np.random.Generator, notes: list[str]) -> 
 def _read_part(folder: Path, part: Any, where: str, library: _Library, notes: list[str]) -> list[Piece]:
     if not isinstance(part, dict):
         raise RecordingError(f"{where} is {_shown(part)}, but a JSON object was expected.")
-    _check_keys(part, where, ("shape", "size", "position", "rotation", "texture", "brightness"))
+    _check_keys(part, where, ("shape", "size", "position", "rotation", "inward", "texture", "brightness"))
     shape, texture = part.get("shape"), part.get("texture")
     if not isinstance(shape, str):
         raise RecordingError(
@@ -471,6 +477,11 @@ def _read_part(folder: Path, part: Any, where: str, library: _Library, notes: li
             corners = np.concatenate([piece.triangles.reshape(-1, 3) for piece in pieces])
             scale = _numbers(part, "size", 1, where, lowest=1e-6)[0] / np.ptp(corners, axis=0).max()
             pieces = [piece.moved(np.diag([scale, scale, scale, 1])) for piece in pieces]
+    inward = part.get("inward", False)
+    if not isinstance(inward, bool):
+        raise RecordingError(f"{where} holds inward = {_shown(inward)}, but true or false was expected.")
+    if inward:
+        pieces = [piece.inside_out() for piece in pieces]
     brightness = _numbers(part, "brightness", 2, where, lowest=0) if "brightness" in part else None
     if texture is not None:
         pieces = _textured(pieces, *library.texture(texture, brightness, where))

@@ -165,7 +165,7 @@ class ImageFolder(Pictures):
                     f"{stamps} holds {len(times):,} times, but {path} {len(files):,} pictures; give one time a picture."
                 )
         else:
-            raise RecordingError(f"{path} needs either --fps or --stamps, the times of its pictures.")
+            raise RecordingError(f"{path} needs either --frames-per-second or --stamps, the times of its pictures.")
         super().__init__(path, times - times[0], gamma, log_eps)
         self.width, self.height = image_size(self.filenames[0])
         for file in self.filenames:
@@ -372,7 +372,9 @@ def _pose(trajectory: Trajectory, time: int) -> np.ndarray:
 
 def _regular_times(path: Path, count: int, rate: float) -> np.ndarray:
     if not 0 < rate < 1e9:
-        raise RecordingError(f"{path} has {rate:g} frames per second, which is no frame rate; give it with --fps.")
+        raise RecordingError(
+            f"{path} has {rate:g} frames per second, which is no frame rate; give it with --frames-per-second."
+        )
     return np.round(np.arange(count) * (1e9 / rate)).astype(np.int64)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
@@ -120,6 +121,18 @@ def from_file(path: Path, notes: list[str], unit: str = "s") -> Trajectory:
         return Trajectory(trajectory.times - trajectory.start, trajectory.positions, trajectory.quaternions)
     times, positions, quaternions = read_poses(path, unit, notes)
     return Trajectory(_from_zero(path, times, f"were taken to be in {unit}"), positions, quaternions)
+
+
+def sampled(trajectory: Trajectory, per_second: int) -> Trajectory:
+    """A trajectory with so many poses a second, in whole microseconds, and one at its end; itself if it has them."""
+    period = 10**9 // per_second
+    if abs(np.median(np.diff(trajectory.times)) - period) < 1000:
+        return trajectory
+    count = (trajectory.end - trajectory.start - period // 2) * per_second // 10**9 + 1
+    times = trajectory.start + np.arange(count) * 10**6 // per_second * 1000
+    times = np.append(times, trajectory.end)
+    poses = trajectory.poses(torch.from_numpy(times)).numpy()
+    return Trajectory(times, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat())
 
 
 def look_at(camera: Float64[np.ndarray, "*batch 3"], target: Float64[np.ndarray, "*batch 3"]) -> Rotation:

@@ -88,6 +88,8 @@ class Setup:
     bayer_pattern: str | None = None
     """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1), (1, 1), such as RGGB; None for a grey one."""
     frame_settings: FrameSettings = field(default_factory=FrameSettings)
+    seed: int = 0
+    """Of the noise of the frames."""
     settings: dict[str, Any] = field(default_factory=dict)
     """All else that simulation.json shall state; what JSON can hold."""
 
@@ -177,10 +179,10 @@ class Writer(ABC):
         """
         assert frame.number == self.num_frames and frame.time == self.setup.frame_times[frame.number]
         assert (frame.blurred is None) == (self.setup.exposure == 0)
-        sharp = develop(frame.sharp, self.setup.frame_settings, frame.number, False)
+        sharp = develop(frame.sharp, self.setup.frame_settings, frame.number, False, self.setup.seed)
         blurred = None
         if frame.blurred is not None:
-            blurred = develop(frame.blurred, self.setup.frame_settings, frame.number, True)
+            blurred = develop(frame.blurred, self.setup.frame_settings, frame.number, True, self.setup.seed)
         name = self._name(frame.number)
         files = {path: _encode_png(image) for path, image in self._images(frame.number, sharp, blurred).items()}
         if self.setup.frame_settings.hdr:

@@ -1,0 +1,203 @@
+"""Whether a simulated camera is anywhere where it should not be: inside of something, or where it sees nothing."""
+
+from __future__ import annotations
+
+from bisect import bisect
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.simulator.render import Renderer
+from enerf_ns.simulator.sources import RenderedScene
+
+PATH_STEP, MOST_PATH_STEPS = 2_000_000, 10_000
+"""Nanoseconds of the way that are taken for a straight line, and at most how many of these lines."""
+
+LOOK_STEP, MOST_LOOKS = 10_000_000, 1000
+"""Nanoseconds from one look at the scene to the next, and at most how many looks."""
+
+FEWEST_STEPS = 50
+"""Lines and looks, at least."""
+
+PLACES = 20
+"""Where all surfaces around the camera are looked for; in between, those that it passes through."""
+
+INSIDE = 0.5
+"""Winding number above which a camera is inside; of a closed surface it is 1 there and 0 outside."""
+
+SAME_PLACE = 1e-6
+"""Of a line, between places at which it passes through surfaces."""
+
+PIXEL_STEP = 8
+"""Of all rows and columns, one of so many is looked along first."""
+
+GRID_BITS = 21
+"""Corners are one if they are the same in so many bits of each coordinate."""
+
+
+def check_view(name: str, what: str, source: RenderedScene, start: int, end: int, notes: list[str]) -> None:
+    """Whether a camera is outside of everything at all times, and sees a surface at some.
+
+    Args:
+        name: Of the scene, for the errors.
+        what: The camera, for errors and notes.
+        source: The scene as the camera sees it.
+        start, end: From when to when, ns.
+        notes: Gains a sentence if there are times at which the camera sees nothing.
+
+    Raises:
+        RecordingError: The camera is inside of a surface that looks outwards, or never sees anything.
+    """
+    path_times, look_times = (
+        np.linspace(start, end, int(np.clip((end - start) // step, FEWEST_STEPS, most)) + 1).astype(np.int64)
+        for step, most in ((PATH_STEP, MOST_PATH_STEPS), (LOOK_STEP, MOST_LOOKS))
+    )
+    _check_outside(name, what, source.renderer.scene.triangles, source.trajectory, path_times)
+    _check_sight(name, what, source, look_times, notes)
+
+
+def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Trajectory, times: np.ndarray) -> None:
+    """Whether a camera stays outside of all surfaces that look outwards, and are closed or nearly so.
+
+    Each connected part of the triangles is looked at for itself, by its generalised winding number (Jacobson, Kavan,
+    Sorkine-Hornung, SIGGRAPH 2013), since the room that a solid stands in has -1 at all places.
+    """
+    parts = _Parts(triangles)
+    positions = _poses(trajectory, times)[:, :, 3]
+    some = np.linspace(0, len(times) - 1, PLACES).astype(int)
+    found = [(float(at), part) for at in some for part in parts.around(positions[at])]
+    crossings = _crossings(parts, positions)
+    stops = [*(at for at, _ in crossings), len(times) - 1.0]
+    for at, part in crossings:
+        following = stops[min(bisect(stops, at + SAME_PLACE), len(crossings))]
+        found.append(((at + following) / 2, part))
+    for at, part in sorted(found):
+        position = np.array([np.interp(at, np.arange(len(times)), axis) for axis in positions.T])
+        corners = parts.corners(part)
+        if winding_number(corners, position) > INSIDE:
+            seconds = (np.interp(at, np.arange(len(times)), times) - times[0]) * 1e-9
+            lower, upper = corners.min((0, 1)), corners.max((0, 1))
+            raise RecordingError(
+                f"{name}: {seconds:.3f} s after the beginning {what} is at {_shown(position)} m, inside of a surface "
+                f"that looks outwards and reaches from {_shown(lower)} to {_shown(upper)} m; move the camera or what "
+                "it is in, or, if that is a room, turn its faces to look inwards (inward of a scene file's part)."
+            )
+
+
+def _check_sight(name: str, what: str, source: RenderedScene, times: np.ndarray, notes: list[str]) -> None:
+    """Whether a camera sees a surface: tried along some pixels, and if these see nothing, along all."""
+    scene, camera, trajectory = source.renderer.scene, source.renderer.camera, source.trajectory
+    directions = camera.pixel_directions()[::PIXEL_STEP, ::PIXEL_STEP, :2]
+    height, width = directions.shape[:2]
+    coarse = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, model="lookup", directions=directions)
+    looks = RenderedScene(Renderer(scene, coarse), trajectory), source
+    blind = np.array([not any(look.depth(time).any() for look in looks) for time in times.tolist()])
+    if blind.all():
+        pose = _poses(trajectory, times[:1])[0]
+        lower, upper = scene.triangles.min((0, 1)), scene.triangles.max((0, 1))
+        raise RecordingError(
+            f"{name}: {what} never sees anything, since all surfaces lie between {_shown(lower)} and {_shown(upper)} "
+            f"m, but at the beginning it is at {_shown(pose[:, 3])} m and looks along {_shown(pose[:, 2])}; move or "
+            "turn it."
+        )
+    if blind.any():
+        first, last = _longest(blind)
+        start, end = (times[[first, last]] - times[0]) * 1e-9
+        notes.append(
+            f"{name}: {what} sees nothing for {100 * blind.mean():.3g} % of the time, longest from {start:.3f} to "
+            f"{end:.3f} s."
+        )
+
+
+def winding_number(corners: Float64[np.ndarray, "faces 3 3"], point: Float64[np.ndarray, "3"]) -> float:
+    """How many times triangles surround a point, by their solid angles (van Oosterom and Strackee, 1983).
+
+    Args:
+        corners: In metres, counter-clockwise as seen from outside.
+        point: In metres.
+    """
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    lengths = np.linalg.norm(corners - point, axis=2)
+    la, lb, lc = lengths.T
+    volume = (a * np.cross(b, c)).sum(1)
+    rest = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+    return float(np.arctan2(volume, rest).sum() / (2 * np.pi))
+
+
+class _Parts:
+    """The triangles of a scene, part by part; triangles with a corner in one place are of one part."""
+
+    def __init__(self, triangles: Float32[np.ndarray, "faces 3 3"]):
+        corners = triangles.reshape(-1, 3).astype(np.float64)
+        grid = (corners - corners.min(0)) * ((2**GRID_BITS - 1) / np.ptp(corners, axis=0).max())
+        places = np.rint(grid).astype(np.int64) @ (1 << GRID_BITS * np.arange(3))
+        _, vertices = np.unique(places, return_inverse=True)
+        first, second, third = vertices.reshape(-1, 3).T
+        edges = np.concatenate([first, first]), np.concatenate([second, third])
+        _, part = connected_components(coo_array((np.ones(len(edges[0])), edges), shape=2 * (vertices.max() + 1,)))
+        part = part[first]
+        order = np.argsort(part, kind="stable")
+        self.triangles, self.number = corners.reshape(-1, 3, 3)[order], part[order]
+        self.starts = np.append(np.flatnonzero(np.diff(self.number, prepend=-1)), len(order))
+        self.lower = np.minimum.reduceat(self.triangles.min(1), self.starts[:-1])
+        self.upper = np.maximum.reduceat(self.triangles.max(1), self.starts[:-1])
+
+    def corners(self, part: int) -> Float64[np.ndarray, "faces 3 3"]:
+        return self.triangles[self.starts[part] : self.starts[part + 1]]
+
+    def around(self, point: Float64[np.ndarray, "3"]) -> list[int]:
+        """Parts in whose bounding box a point is; of no other it can be inside."""
+        return np.flatnonzero(((self.lower <= point) & (point <= self.upper)).all(1)).tolist()
+
+
+def _crossings(parts: _Parts, positions: Float64[np.ndarray, "positions 3"]) -> list[tuple[float, int]]:
+    """Where on the way from position to position, 0.5 is halfway to the second, which parts are passed through."""
+    lower, upper = parts.triangles.min(1), parts.triangles.max(1)
+    near = ((lower <= positions.max(0)) & (upper >= positions.min(0))).all(1)
+    triangles, number, lower, upper = parts.triangles[near], parts.number[near], lower[near], upper[near]
+    crossings = []
+    for i, (start, end) in enumerate(pairwise(positions)):
+        close = np.flatnonzero(((lower <= np.maximum(start, end)) & (upper >= np.minimum(start, end))).all(1))
+        if len(close):
+            passed = _passed(triangles[close], start, end)
+            there = (passed >= 0) & (passed <= 1)
+            crossings += zip((i + passed[there]).tolist(), number[close][there].tolist(), strict=True)
+    return sorted(crossings)
+
+
+def _passed(
+    triangles: Float64[np.ndarray, "faces 3 3"], start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, " faces"]:
+    """Share of a line that is over where it passes through each triangle; nan where it does not (Möller, Trumbore)."""
+    first, direction = triangles[:, 0], end - start
+    one, other = triangles[:, 1] - first, triangles[:, 2] - first
+    across, offset = np.cross(direction, other), start - first
+    turned = np.cross(offset, one)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / (one * across).sum(1)
+        u, v = scale * (offset * across).sum(1), scale * (turned @ direction)
+        passed = scale * (other * turned).sum(1)
+    slack = 1e-9
+    return np.where((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack), passed, np.nan)
+
+
+def _poses(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
+    return trajectory.poses(torch.from_numpy(times)).numpy()
+
+
+def _longest(mask: Bool[np.ndarray, " times"]) -> tuple[int, int]:
+    """First and last index of the longest run."""
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
+    first, after = edges[np.argmax(np.diff(edges, axis=1))].tolist()
+    return first, after - 1
+
+
+def _shown(point: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in point)})"
