@@ -99,9 +99,9 @@ class Simulate:
     """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
     preset, or 20."""
     width: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset, or 160."""
+    """Of events and frames, in pixels. None: as the preset, or 160, or as the height has it at the same proportions."""
     height: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset, or 120."""
+    """Of events and frames, in pixels. None: as the preset, or 120, or as the width has it at the same proportions."""
     field_of_view: Optional[float] = None  # noqa: UP045
     """Horizontal, in degrees. None: as the preset, or 60."""
     cameras: Optional[Path] = None  # noqa: UP045
@@ -329,8 +329,9 @@ class Simulate:
 
     def _pinhole(self) -> Camera:
         preset = self._preset
-        width = self.width or (preset.width if preset else SIZE[0])
-        height = self.height or (preset.height if preset else SIZE[1])
+        usual = (preset.width, preset.height) if preset else SIZE
+        width = self.width or max(1, round((self.height or usual[1]) * usual[0] / usual[1]))
+        height = self.height or max(1, round(width * usual[1] / usual[0]))
         angle = self.field_of_view or (preset.field_of_view if preset else FIELD_OF_VIEW)
         focal_length = float(width / 2 / np.tan(np.radians(angle / 2)))
         return Camera(width, height, focal_length, focal_length, width / 2, height / 2)

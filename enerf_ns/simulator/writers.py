@@ -296,8 +296,8 @@ class Writer(ABC):
             reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
             raise RecordingError(
                 f"{self.folder} could not be written any further ({reason}); what was written before, "
-                f"{self.num_frames} frames and the events up to there, can be read, but make room for more or give "
-                "another folder."
+                f"{self.num_frames} frame{'s' * (self.num_frames != 1)} and the events up to there, can be read, but "
+                "make room for more or give another folder."
             ) from error
 
 
