@@ -39,11 +39,15 @@ def inverse_linlog(log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*b
     return torch.where(log_brightness < knee, log_brightness / slope, torch.exp(log_brightness.clamp(min=knee))) / 255.0
 
 
+LUMA = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in what a grey sensor sees (ITU-R BT.601)."""
+
+
 def luma(rgb: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch"]:
     """Brightness that a grey sensor sees of one or three colour channels (ITU-R BT.601 weights)."""
     if rgb.shape[-1] == 1:
         return rgb[..., 0]
-    return rgb @ rgb.new_tensor([0.299, 0.587, 0.114])
+    return rgb @ rgb.new_tensor(LUMA)
 
 
 def color_channels(pattern: str, width: int, height: int) -> Int64[Tensor, " pixels"]:

@@ -186,14 +186,14 @@ def test_surfaces_become_one_scene_with_texels_per_metre_and_shared_textures():
     assert scene.texels.shape == (5461 + 341 + 1, 3)
 
 
-def test_a_grey_camera_sees_the_luminance_of_a_coloured_texture():
+def test_a_grey_camera_sees_the_luma_of_a_coloured_texture():
     image = RNG(0).uniform(size=(4, 4, 3))
     shade = RNG(1).uniform(size=(1, 3, 1))
     scene = build_scene([Surface(np.eye(3)[None], np.eye(3)[None, :, :2], shade, image)], (0, -1, 0), (0, 0, 0))
     grey = scene.grey()
     assert grey.channels == 1 and grey.grey() is grey
-    luminance = 0.2126 * image[..., 0] + 0.7152 * image[..., 1] + 0.0722 * image[..., 2]
-    np.testing.assert_allclose(grey.texels[:16, 0], luminance.ravel(), rtol=1e-5)
+    luma = 0.299 * image[..., 0] + 0.587 * image[..., 1] + 0.114 * image[..., 2]
+    np.testing.assert_allclose(grey.texels[:16, 0], luma.ravel(), rtol=1e-5)
     np.testing.assert_allclose(grey.shade, shade, rtol=1e-5)
 
 

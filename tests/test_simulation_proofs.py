@@ -65,7 +65,7 @@ def times_of(source: RenderedScene, stops: np.ndarray, max_displacement: float =
 def events_of(source: Source, times: np.ndarray, settings: SensorSettings, threads: int = 2) -> Events:
     first, *renders = adaptive_renders(source.brightness, times, log_eps=EPS, threads=threads)
     sensor = EventSensor(settings, first.brightness, first.time)
-    pieces = [sensor.advance(picture, time, before) for time, picture, before, _ in renders]
+    pieces = [sensor.advance(picture, time, before) for time, picture, before in renders]
     return joined([*pieces, sensor.finish()])
 
 

@@ -309,3 +309,31 @@ def test_thresholds_are_those_of_the_preset_unless_given(tmp_path):
             contrast_thresholds=given,
         ).main()  # fmt: skip
         assert read_recording(folder).contrast_thresholds == expected
+
+
+def test_frames_in_colour_leave_the_events_as_they_are(tmp_path):
+    counts = []
+    for color in (False, True):
+        Simulate(tmp_path / str(color), "roads", color=color, **SHORT).main()
+        counts.append(len(read_recording(tmp_path / str(color)).index))
+    assert counts[0] == pytest.approx(counts[1], rel=0.001)
+
+
+@pytest.mark.parametrize(("duration", "num_frames"), [(0.3, 12), (2.3, 94)])
+def test_frames_are_as_dense_whatever_the_duration(tmp_path, duration, num_frames):
+    """Also where the times of rendering are found in several pieces."""
+    Simulate(tmp_path / "new", "carpet", motion="spiral", duration=duration, width=16, height=12).main()
+    read = read_recording(tmp_path / "new")
+    assert read.frames is not None and len(read.frames.times) == num_frames
+    assert read.trajectory.end == round(duration * 1e9)
+    assert json.loads((tmp_path / "new/simulation.json").read_text())["settings"]["motion"] == "spiral"
+    stamps = np.concatenate([events.t for events in read.stream_events()])
+    assert (np.diff(stamps) >= 0).all() and stamps[-1] > 0.9 * read.trajectory.end
+
+
+def test_pictures_need_no_layout(tmp_path):
+    for number in range(30):
+        picture = np.full((12, 16), 60 + 60 * (number % 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
+    Simulate(tmp_path / "new", str(tmp_path), frames_per_second=30).main()
+    assert (tmp_path / "new/recording.json").exists()

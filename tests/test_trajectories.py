@@ -163,7 +163,7 @@ def test_look_at_is_the_same_for_one_camera_and_many():
 
 
 def test_the_spiral_goes_inwards_about_the_line_to_the_target_and_looks_at_it():
-    trajectory = spiral(10**9, CAMERA, TARGET, np.random.default_rng(0), turns=4)
+    trajectory = spiral(10**9, CAMERA, TARGET, np.random.default_rng(0), turns_per_second=4)
     axis = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
     offsets = trajectory.positions - CAMERA
     radius = np.linalg.norm(offsets, axis=1)

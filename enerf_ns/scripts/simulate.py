@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
 
@@ -31,7 +32,7 @@ from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, Render, ad
 from enerf_ns.simulator.scene_files import load_scene
 from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
-from enerf_ns.simulator.trajectories import MOTIONS, from_file, key_frames, sampled
+from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
 from enerf_ns.simulator.views import check_view
 from enerf_ns.simulator.writers import Setup, Writer, open_writer
 
@@ -39,11 +40,17 @@ CONSOLE = Console(width=120)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
-SECONDS, NUM_FRAMES, EXPOSURE_MS, SIZE, FIELD_OF_VIEW = 1.0, 41, 20.0, (160, 120), 60.0
-"""Of a recording for which neither a preset nor a flag states them."""
+SECONDS, FRAME_RATE, EXPOSURE_MS, SIZE, FIELD_OF_VIEW = 1.0, 41.0, 20.0, (160, 120), 60.0
+"""Of a recording for which neither a preset nor a flag states them; frames are counted per second."""
+
+WINDOW = 10**9
+"""Nanoseconds for which it is found out at once when to render."""
 
 MOST_PIXELS = 2**24
 """Of a camera; rendering takes up to a kilobyte of memory for each."""
+
+SPARSE = 10_000_000
+"""Nanoseconds between poses, above which they are made denser where a second camera is mounted on the first."""
 
 PUBLISHED_RIGS = {
     "eds": (eds.PUBLISHED_EVENT_CAMERA, eds.PUBLISHED_RGB_CAMERA, eds.PUBLISHED_EXTRINSICS),
@@ -94,20 +101,21 @@ class Simulate:
     duration: Optional[float] = None  # noqa: UP045
     """Length of the recording in seconds. None: that of the preset, the trajectory or the video, or 1."""
     num_frames: Optional[int] = None  # noqa: UP045
-    """Frames, at regular times. None: as the preset, or 41."""
+    """Frames, at regular times. None: as many a second as the preset, or 41."""
     exposure_ms: Optional[float] = None  # noqa: UP045
     """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
-    preset, or 20."""
+    preset, or 20, but no longer than from one frame to the next."""
     width: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset, or 160, or as the height has it at the same proportions."""
+    """Of events and frames, in pixels. None: as the preset or the run, or 160; in proportion, if height is given."""
     height: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset, or 120, or as the width has it at the same proportions."""
+    """Of events and frames, in pixels. None: as the preset or the run, or 120; in proportion, if width is given."""
     field_of_view: Optional[float] = None  # noqa: UP045
-    """Horizontal, in degrees. None: as the preset, or 60."""
+    """Horizontal, in degrees. None: as the preset or the run, or 60."""
     cameras: Optional[Path] = None  # noqa: UP045
     """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
-    layout: Literal["esim", "eds", "tum_vie", "event_recording"] = "esim"
-    """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own."""
+    layout: Optional[Literal["esim", "eds", "tum_vie", "event_recording"]] = None  # noqa: UP045
+    """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim, and for
+    images, videos and runs this package's own."""
     color: bool = False
     """Frames in colour, where the scene is."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
@@ -136,6 +144,8 @@ class Simulate:
                 f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
             )
         self._check_flags()
+        self.layout = self.layout or ("event_recording" if self._pictures or self.from_run else "esim")
+        self._check_use()
         thresholds = self.contrast_thresholds or (self._preset and self._preset.contrast_thresholds)
         if thresholds:
             self.sensor = replace(self.sensor, contrast_thresholds=thresholds)
@@ -160,8 +170,9 @@ class Simulate:
             bayer_pattern=self.bayer_pattern,
             frame_settings=self.frame,
             seed=self.sensor.seed,
-            settings=self._settings(),
+            settings=self._settings(view, exposures),
         )
+        is_new = not output_dir.exists()
         try:
             output_dir.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -169,7 +180,8 @@ class Simulate:
                 f"{output_dir} cannot be made a folder ({error.strerror}); give another --output-dir."
             ) from error
         with ExitStack() as stack:
-            stack.callback(_remove_if_empty, output_dir)
+            if is_new:
+                stack.callback(_remove_if_empty, output_dir)
             writer = stack.enter_context(open_writer(self.layout, output_dir, setup))
             preview = None
             if self.preview:
@@ -202,19 +214,19 @@ class Simulate:
         ):  # fmt: skip
             if value is not None and not fine(value):
                 raise RecordingError(f"{flag} is {value}, but must be {expected}.")
-        if (self.scene is None) == (self.from_run is None):
+        if bool(self.scene) == (self.from_run is not None):
             raise RecordingError("Give either what is to be seen, such as shapes or a mesh, or --from-run config.yml.")
-        self._check_use()
 
     def _check_use(self) -> None:
         """Refuses flags that would change nothing."""
         poses_file = self.trajectory is not None and not self.trajectory.expanduser().is_dir()
         sizes = ("--width", "--height", "--field-of-view")
-        rig = PUBLISHED_RIGS.get(self.layout)
+        rig = PUBLISHED_RIGS.get(self.layout or "")
         own_rig = rig is not None and self.cameras is None and self.from_run is None and self._pictures is None
         for applies, situation, useless in (
             (self._pictures, "for pictures, which have their size and no poses",
-             ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement")),
+             ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement",
+              "--max-change")),
             (self._pictures is None, "without a folder of images or a video",
              ("--frames-per-second", "--stamps", "--no-gamma")),
             (self._pictures and self._pictures.is_file(), "for a video", ("--stamps",)),
@@ -250,9 +262,9 @@ class Simulate:
             return self._pictures_view(self._pictures, end)
         if self.from_run is not None:
             trajectory = self._given_trajectory(notes)
-            camera = self._pinhole() if self.width or self.height or self.field_of_view else None
-            duration = end or round(SECONDS * 1e9)
-            run = TrainedRun(self.from_run.expanduser().resolve(), trajectory, duration, camera)
+            run = TrainedRun(self.from_run.expanduser().resolve(), trajectory, end or round(SECONDS * 1e9))
+            if self.width or self.height or self.field_of_view:
+                run.camera = self._pinhole(run.camera)
             end = _until(str(self.trajectory or self.key_frames or self.from_run), run.end, end)
             return View(run, None, run.trajectory, run.camera, run.camera, np.eye(4), run.start, end)
         assert self.scene is not None
@@ -265,8 +277,9 @@ class Simulate:
         trajectory = self._given_trajectory(notes)
         if trajectory is None:
             seconds = self.duration or (preset.duration if preset else SECONDS)
-            if preset and self.motion is None:
-                trajectory = replace(preset, duration=seconds).trajectory(scene.camera, scene.target, motion_rng)
+            if preset:
+                moved = replace(preset, duration=seconds, motion=self.motion or preset.motion)
+                trajectory = moved.trajectory(scene.camera, scene.target, motion_rng)
             else:
                 motion = MOTIONS[self.motion or "shake"]
                 trajectory = motion(round(seconds * 1e9), scene.camera, scene.target, motion_rng)
@@ -287,6 +300,9 @@ class Simulate:
         events = RenderedScene(Renderer(scene, event_camera), trajectory)
         frames = None
         if frame_camera != event_camera or (event_from_frame != np.eye(4)).any():
+            if np.diff(trajectory.times).max() > SPARSE:
+                trajectory = sampled(trajectory, POSES_PER_SECOND)  # so that both cameras stay as they are mounted
+                events = RenderedScene(events.renderer, trajectory)
             frames = RenderedScene(Renderer(scene, frame_camera), trajectory.of_mounted(event_from_frame))
         end = _until(str(self.trajectory or self.key_frames), trajectory.end, end)
         names = ("the event camera", "the frame camera") if frames else ("the camera",)
@@ -327,13 +343,17 @@ class Simulate:
             return from_file(self.trajectory.expanduser(), notes, self.trajectory_unit)
         return None
 
-    def _pinhole(self) -> Camera:
+    def _pinhole(self, like: Camera | None = None) -> Camera:
+        """As the flags, and where they are not given as another camera or the preset has it."""
         preset = self._preset
-        usual = (preset.width, preset.height) if preset else SIZE
+        usual, angle = SIZE, FIELD_OF_VIEW
+        if like is not None:
+            usual, angle = (like.width, like.height), 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
+        elif preset is not None:
+            usual, angle = (preset.width, preset.height), preset.field_of_view
         width = self.width or max(1, round((self.height or usual[1]) * usual[0] / usual[1]))
         height = self.height or max(1, round(width * usual[1] / usual[0]))
-        angle = self.field_of_view or (preset.field_of_view if preset else FIELD_OF_VIEW)
-        focal_length = float(width / 2 / np.tan(np.radians(angle / 2)))
+        focal_length = float(width / 2 / np.tan(np.radians((self.field_of_view or angle) / 2)))
         return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 
     def _read_cameras(self) -> tuple[Camera, Camera, np.ndarray]:
@@ -348,11 +368,13 @@ class Simulate:
     def _exposures(self, view: View) -> tuple[np.ndarray, Exposures]:
         """Times of the frames, evenly spread, and their exposures, in whole microseconds."""
         preset = self._preset
-        count = self.num_frames or (preset.num_frames if preset else NUM_FRAMES)
+        length = view.end - view.start
+        rate = preset.num_frames / preset.duration if preset else FRAME_RATE
+        count = self.num_frames or max(1, round(rate * length * 1e-9))
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
-            exposure_ms = preset.exposure_ms if preset else EXPOSURE_MS
-        exposure, length = round(exposure_ms * 500) * 2000, view.end - view.start
+            exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, length // count // 2000 * 2e-3 - 2e-3)
+        exposure = round(exposure_ms * 500) * 2000
         if count * 1000 > length or (count == 1 and exposure > length):
             raise RecordingError(
                 f"{length * 1e-9:g} s have no room for {count} frame{'s' * (count > 1)} with exposures of "
@@ -361,8 +383,13 @@ class Simulate:
         times = view.start + ((np.arange(count) + 0.5) * length / count).astype(np.int64) // 1000 * 1000
         return times, Exposures(times, exposure)
 
-    def _settings(self) -> dict[str, Any]:
+    def _settings(self, view: View, exposures: Exposures) -> dict[str, Any]:
+        """All flags, with what those that were left out came to."""
         settings = asdict(self)
+        settings["duration"] = (view.end - view.start) * 1e-9
+        settings["num_frames"], settings["exposure_ms"] = len(exposures.times), exposures.exposure * 1e-6
+        if self.scene and not (self._pictures or self.key_frames or self.trajectory):
+            settings["motion"] = self.motion or (self._preset.motion if self._preset else "shake")
         for name in ("output_dir", "preview"):
             del settings[name]
         return json.loads(json.dumps(settings, default=str))
@@ -403,7 +430,7 @@ class Simulate:
         columns = (TextColumn("Simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
         with Progress(*columns, console=CONSOLE, transient=True) as progress:
             task = progress.add_task("", total=1.0)
-            for time, picture, before, done in self._renders(view.events, stops):
+            for time, picture, before in self._renders(view.events, stops, self.max_change):
                 if time > view.start:
                     before = [
                         part._replace(brightness=self._seen(part.brightness, view.events, part.pixels))
@@ -418,26 +445,28 @@ class Simulate:
                     assert view.frames is not None
                     add_frame(following, view.frames)
                     following = next(others, None)
-                progress.update(task, completed=done)
+                progress.update(task, completed=(time - view.start) / (view.end - view.start))
             add_events(sensor.finish())
 
-    def _renders(self, source: Source, stops: np.ndarray) -> Iterator[Render]:
+    def _renders(self, source: Source, stops: np.ndarray, max_change: float) -> Iterator[Render]:
         """Pictures at these times, and as many between them as motion and brightness need."""
         if isinstance(source, Pictures):
             times = np.union1d(stops, source.times[(source.times > stops[0]) & (source.times < stops[-1])])
-        elif isinstance(source, RenderedScene):
-            camera = source.renderer.camera
-            times = render_times(camera, source.trajectory, source.depth, stops, self.max_displacement)
-        else:
-            assert isinstance(source, TrainedRun)
-            times = render_times(source.camera, source.trajectory, source.depth, stops, self.max_displacement)
-        max_change = np.inf if isinstance(source, Pictures) else self.max_change
-        return adaptive_renders(source.brightness, times, max_change, self.sensor.log_eps)
+            yield from adaptive_renders(source.brightness, times, np.inf, threads=1)
+            return
+        assert isinstance(source, RenderedScene | TrainedRun)
+        for start, end in pairwise([*range(stops[0], max(stops[-1], stops[0] + 1), WINDOW), stops[-1]]):
+            within = np.union1d([start, end], stops[(stops > start) & (stops < end)])
+            times = render_times(source.camera, source.trajectory, source.depth, within, self.max_displacement)
+            renders = adaptive_renders(source.brightness, times, max_change, self.sensor.log_eps)
+            if start > stops[0]:
+                next(renders)  # the last one of the window before
+            yield from renders
 
     def _frames(self, source: Source, exposures: Exposures) -> Iterator[Frame]:
         """The frames of a camera of their own, which is only rendered during exposures."""
         for stops in np.stack([exposures.opens, exposures.times, exposures.closes], axis=1):
-            for time, picture, _, _ in self._renders(source, np.unique(stops)):
+            for time, picture, _ in self._renders(source, np.unique(stops), np.inf):
                 frame = exposures.add(time, self._shown(picture))
                 if frame is not None:
                     yield frame

@@ -17,8 +17,8 @@ crossing is timed to the nanosecond. The rest is off by default:
 Brightness that makes the photoreceptor faster and less noisy, leak and shot noise that resets a pixel are those of
 v2e (Hu, Liu, Delbruck: v2e: From Video Frames to Realistic DVS Events, CVPRW 2021).
 
-Randomness is a function of the seed, the pixel and a running number of its noise or its events. It depends neither on
-threads nor on how many pictures there are: events of static scenes are the same however often a picture is given.
+Randomness is a function of the seed, the pixel and a running number of its noise or its events, and does not depend on
+threads: events of static scenes are the same however often a picture is given.
 """
 
 from __future__ import annotations
@@ -38,11 +38,17 @@ from enerf_ns.dataparsers.recording import Events, RecordingError
 READOUT_QUEUE = 1000
 """Events that may wait for the bus; one that comes while so many wait is lost."""
 
+SENSOR = 1
+"""Draws, with the seed, what is of the sensor; scene and motion are drawn from the seed alone."""
+
 CUT_JITTER = 6
 """Standard deviations that jitter is cut at."""
 
 TOLERANCE = 1e-9
 """Log brightness by which a threshold may be missed and still be reached: far above rounding, far below any noise."""
+
+LEAST_THRESHOLD = 0.001
+"""Change of log brightness; sensors have more than ten times as much, and events beyond number would follow."""
 
 NEVER = 2**62
 """Nanoseconds."""
@@ -85,7 +91,8 @@ class SensorSettings:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "contrast_thresholds":
-                fine, expected = len(value) == 2 and all(0 < c < math.inf for c in value), "two numbers above 0"
+                fine = len(value) == 2 and all(LEAST_THRESHOLD <= c < math.inf for c in value)
+                expected = f"two numbers of at least {LEAST_THRESHOLD}"
             elif field.name == "log_eps":
                 fine, expected = 0 < value < math.inf, "above 0"
             elif field.name == "hot_pixels":
@@ -156,17 +163,18 @@ class EventSensor:
         self.settings, self.start, self.time = settings, int(time), int(time)
         self.height, self.width = brightness.shape
         size = brightness.size
-        threshold_rng, hot_rng = np.random.default_rng(settings.seed).spawn(2)
+        drawn = np.random.SeedSequence([settings.seed, SENSOR])
+        threshold_rng, hot_rng = np.random.default_rng(drawn).spawn(2)
         spread = 1 + settings.threshold_spread * threshold_rng.standard_normal((2, *brightness.shape))
         self.contrast_thresholds = spread * np.array(settings.contrast_thresholds)[:, None, None]
-        without = np.count_nonzero((self.contrast_thresholds <= 0).any(0))
+        without = np.count_nonzero((self.contrast_thresholds < LEAST_THRESHOLD).any(0))
         if without:
             raise RecordingError(
-                f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels with a "
-                "threshold of 0 or less; give a smaller one."
+                f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
+                f"threshold of {LEAST_THRESHOLD} or more; give a smaller one."
             )
         self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))
-        self._keys = np.random.SeedSequence(settings.seed).generate_state(4, np.uint64)
+        self._keys = drawn.generate_state(4, np.uint64)
         self._all = np.arange(size)
         self._log_brightness = self._logarithm(brightness, self._all, self.time)
 

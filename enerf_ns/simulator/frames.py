@@ -9,6 +9,9 @@ from jaxtyping import Float, Int64, UInt8
 
 from enerf_ns.dataparsers.recording import RecordingError
 
+MOST_LEVEL = 1e6
+"""Of what is white; pixels brighter than this have the noise of this."""
+
 
 @dataclass(frozen=True)
 class FrameSettings:
@@ -29,9 +32,9 @@ class FrameSettings:
 
     def __post_init__(self) -> None:
         for name, fine, expected in (
-            ("saturation", 0 < self.saturation < np.inf, "a brightness above 0"),
+            ("saturation", 1e-9 <= self.saturation < np.inf, "a brightness above 0"),
             ("read noise", 0 <= self.read_noise < np.inf, "grey levels from 0 on"),
-            ("shot noise", 0 <= self.shot_noise < np.inf, "electrons from 0 on"),
+            ("shot noise", 0 <= self.shot_noise <= 1e9, "electrons from 0 to 1e9"),
         ):
             if not fine:
                 value = getattr(self, name.replace(" ", "_"))
@@ -151,7 +154,7 @@ def develop(
     rng = np.random.default_rng([seed, number, int(blurred)])
     level = np.asarray(brightness, np.float64) / settings.saturation
     if settings.shot_noise:
-        level = rng.poisson(level * settings.shot_noise) / settings.shot_noise
+        level = rng.poisson(level.clip(0, MOST_LEVEL) * settings.shot_noise) / settings.shot_noise
     grey = 255 * level
     if settings.read_noise:
         grey += rng.normal(0, settings.read_noise, grey.shape)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.trajectories import shake, spiral
+from enerf_ns.simulator.trajectories import MOTIONS
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,7 @@ class SimulationPreset:
     def trajectory(self, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> Trajectory:
         """The motion of this preset before a scene; arguments as of `trajectories.shake`."""
         duration = round(self.duration * 1e9)
-        if self.motion == "shake":
-            return shake(duration, camera, target, rng, self.turns_per_second)
-        return spiral(duration, camera, target, rng, self.turns_per_second * self.duration)
+        return MOTIONS[self.motion](duration, camera, target, rng, self.turns_per_second)
 
 
 PRESETS = {

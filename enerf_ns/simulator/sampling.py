@@ -23,7 +23,8 @@ STEPS_PER_DEPTH = 5
 """Of these steps, for which the points that the camera sees in their middle are followed."""
 
 GRID = 64
-"""Points that are followed, across and down the picture, or every pixel where it has fewer."""
+"""Points that are followed, across and down the picture, or every pixel where it has fewer; each as near as the nearest
+thing seen between it and the next."""
 
 MAX_DISPLACEMENT = 0.5
 """Pixels, from one picture to the next."""
@@ -45,8 +46,6 @@ class Render(NamedTuple):
     """Linear."""
     before: list[PartialPicture]
     """Pixels whose brightness was needed between the last picture and this one, in the order of time."""
-    done: float
-    """Share of the pictures of the sequence that end with this one, from 0 to 1."""
 
 
 def render_times(
@@ -59,8 +58,8 @@ def render_times(
 ) -> Int64[np.ndarray, " times"]:
     """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
 
-    Adds up, from millisecond to millisecond, the displacement of the point that moves most (of a grid over the
-    picture), and divides the sum evenly between two stops.
+    Adds up, from millisecond to millisecond, the displacement of the point that moves most, of a grid over the picture
+    with the nearest depth around each, and divides the sum evenly between two stops. Depth is looked at every 5 ms.
 
     Args:
         camera: That moves.
@@ -73,7 +72,7 @@ def render_times(
     Returns:
         Nanoseconds, strictly increasing, from the first stop to the last, all stops among them.
     """
-    rows, columns = (np.unique(np.linspace(0, n - 1, GRID).round().astype(int)) for n in (camera.height, camera.width))
+    rows, columns = (np.unique(np.linspace(0, n, GRID, False).astype(int)) for n in (camera.height, camera.width))
     grid = np.ix_(rows, columns)
     rays = camera.pixel_directions()[grid].reshape(-1, 3)
     lengths = np.linalg.norm(rays, axis=1)[:, None, None]
@@ -90,9 +89,11 @@ def render_times(
     def displacements(first: int) -> np.ndarray:
         followed = poses[first : first + STEPS_PER_DEPTH + 1]
         middle = first + len(followed) // 2
-        depths = depth(int(times[middle]))[grid].reshape(-1, 1)
-        seen = depths[:, 0] > 0
-        points = (rays * depths)[seen] @ poses[middle, :, :3].T + poses[middle, :, 3]
+        seen_depth = depth(int(times[middle]))
+        nearest = np.minimum.reduceat(np.where(seen_depth > 0, seen_depth, np.inf), rows, axis=0)
+        depths = np.minimum.reduceat(nearest, columns, axis=1).reshape(-1, 1)
+        seen = depths[:, 0] < np.inf
+        points = (rays[seen] * depths[seen]) @ poses[middle, :, :3].T + poses[middle, :, 3]
         directions = (points - followed[:, None, :, 3]) @ followed[:, :, :3]
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         moved = np.einsum("nij,snj->sni", pixels_per_unit[seen], np.diff(directions, axis=0))
@@ -117,12 +118,12 @@ def adaptive_renders(
 ) -> Iterator[Render]:
     """Pictures at the given times, and between them the pixels of which they do not tell enough.
 
-    Between two times at which a pixel is rendered its log brightness differs by no more than `max_change`, and strays
-    by no more than an eighth of the square of that from the straight line that events are made from: by 0.011 for 0.3.
-    So far strays the logarithm of a brightness that changes linearly by `max_change`; of others the error is estimated
-    by second differences, which also tell where a pixel becomes darker and brighter again. Where either is more, the
-    interval is halved, at most `MOST_HALVINGS` times. The first and the last interval have a picture on one side alone
-    to take second differences with.
+    Between two times at which a pixel is rendered its log brightness should differ by no more than `max_change`, and
+    stray by no more than an eighth of the square of that from the straight line that events are made from: by 0.011 for
+    0.3. So far strays the logarithm of a brightness that changes linearly by `max_change`; of others the error is
+    estimated by second differences, which also tell where a pixel becomes darker and brighter again. Where either is
+    more, the interval is halved, but at most `MOST_HALVINGS` times. The first and the last interval have a picture on
+    one side alone to take second differences with.
 
     What is rendered depends on brightness alone. A few pictures are rendered ahead; an exception of a render is raised
     instead of its picture or of the one before, to which it is a neighbour.
@@ -190,7 +191,7 @@ def adaptive_renders(
             submit(index + 2 * threads)
             picture = pictures[index].result()
             before = partial_pictures.pop(index).result() if index > 0 else []
-            yield Render(time, picture, before, index / max(1, len(times) - 1))
+            yield Render(time, picture, before)
             pictures.pop(index - 2, None)
     finally:
         pool.shutdown(cancel_futures=True)

@@ -14,13 +14,11 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 from trimesh.transformations import rotation_matrix, transform_points
 
+from enerf_ns.event_camera import LUMA
 from enerf_ns.simulator import textures
 
 LIGHT = np.array([-0.4, -0.7, 0.6]) / np.linalg.norm([-0.4, -0.7, 0.6])
 """Direction towards the light, far away."""
-
-LUMINANCE = np.array([[0.2126], [0.7152], [0.0722]], np.float32)
-"""Share of linear red, green and blue in the brightness that a grey camera sees."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +55,15 @@ class Scene:
         return self.texels.shape[1]
 
     def grey(self) -> Scene:
-        """The scene as a grey camera sees it: with the luminance of its colours (ITU-R BT.709) instead of them.
+        """The scene as a grey camera sees it: with the luma of its colours (see `event_camera`) instead of them.
 
         That of a product of two colours, of a texture's and a corner's, is taken to be that of the one times that of
         the other.
         """
         if self.channels == 1:
             return self
-        return replace(self, shade=self.shade @ LUMINANCE, texels=self.texels @ LUMINANCE)
+        weights = np.array(LUMA, np.float32)[:, None]
+        return replace(self, shade=self.shade @ weights, texels=self.texels @ weights)
 
 
 @dataclass(frozen=True)

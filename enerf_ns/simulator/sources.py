@@ -63,7 +63,7 @@ class RenderedScene:
     """A scene as the camera of a renderer sees it, moving along a trajectory."""
 
     def __init__(self, renderer: Renderer, trajectory: Trajectory):
-        self.renderer, self.trajectory = renderer, trajectory
+        self.renderer, self.camera, self.trajectory = renderer, renderer.camera, trajectory
         self.width, self.height = renderer.width, renderer.height
         self.start, self.end = trajectory.start, trajectory.end
 
@@ -296,8 +296,17 @@ class TrainedRun:
         else:
             self.camera = camera or _camera(outputs.cameras[0])
             self.trajectory = trajectory or self._past(outputs.cameras, duration)
-        self.width, self.height = self.camera.width, self.camera.height
         self.start, self.end = self.trajectory.start, self.trajectory.end
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return self.camera.width
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        return self.camera.height
 
     def brightness(
         self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None

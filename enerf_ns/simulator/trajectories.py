@@ -55,15 +55,15 @@ def shake(
 
 
 def spiral(
-    duration: int, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator, turns: float = 3
+    duration: int, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator, turns_per_second: float = 3
 ) -> Trajectory:
     """Inward-facing spiral about the line from the camera to the target: its radius shrinks from 0.5 to 0.1 metres.
 
-    Args as for `shake`; `rng` draws the angle at which it starts.
+    Args as for `shake`; `rng` draws the angle at which it starts, and a turn is one round.
     """
     times = _pose_times(duration)
     done = times / duration
-    angle = 2 * np.pi * (turns * done + rng.uniform())
+    angle = 2 * np.pi * (turns_per_second * times * 1e-9 + rng.uniform())
     radius = 0.5 - 0.4 * done
     offsets = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(len(times))], axis=1)
     positions = camera + look_at(camera, target).apply(offsets)
