@@ -366,6 +366,8 @@ def read_cameras(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]
         RecordingError: The file is missing or holds no such cameras.
     """
     about = read_json(path)
+    if MOUNTING_KEY in about:
+        raise RecordingError(f"{path} holds {MOUNTING_KEY} beside frame_camera, but it belongs inside of it.")
     camera = parse_camera(path, "camera", about.get("camera"))
     if "frame_camera" not in about:
         return camera, camera, np.eye(4)

@@ -312,11 +312,12 @@ def test_thresholds_are_those_of_the_preset_unless_given(tmp_path):
 
 
 def test_frames_in_colour_leave_the_events_as_they_are(tmp_path):
+    """But for those at pixels that are rendered once more since one of their colours changes more than their mean."""
     counts = []
     for color in (False, True):
         Simulate(tmp_path / str(color), "roads", color=color, **SHORT).main()
         counts.append(len(read_recording(tmp_path / str(color)).index))
-    assert counts[0] == pytest.approx(counts[1], rel=0.001)
+    assert counts[0] == pytest.approx(counts[1], rel=0.01)
 
 
 @pytest.mark.parametrize(("duration", "num_frames"), [(0.3, 12), (2.3, 94)])
@@ -326,7 +327,7 @@ def test_frames_are_as_dense_whatever_the_duration(tmp_path, duration, num_frame
     read = read_recording(tmp_path / "new")
     assert read.frames is not None and len(read.frames.times) == num_frames
     assert read.trajectory.end == round(duration * 1e9)
-    assert json.loads((tmp_path / "new/simulation.json").read_text())["settings"]["motion"] == "spiral"
+    assert json.loads((tmp_path / "new/simulation.json").read_text())["motion"] == "spiral"
     stamps = np.concatenate([events.t for events in read.stream_events()])
     assert (np.diff(stamps) >= 0).all() and stamps[-1] > 0.9 * read.trajectory.end
 
@@ -337,3 +338,20 @@ def test_pictures_need_no_layout(tmp_path):
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
     Simulate(tmp_path / "new", str(tmp_path), frames_per_second=30).main()
     assert (tmp_path / "new/recording.json").exists()
+
+
+def test_a_colour_filter_needs_colours_and_a_layout_for_it(tmp_path):
+    with pytest.raises(RecordingError, match=r"^--layout esim has no place for a --bayer-pattern; give"):
+        Simulate(tmp_path / "new", "roads", bayer_pattern="RGGB", layout="esim", **SHORT).main()
+    with pytest.raises(RecordingError, match=r"^--bayer-pattern needs colours, but carpet is grey\.$"):
+        Simulate(tmp_path / "new", "carpet", bayer_pattern="RGGB", **SHORT).main()
+    Simulate(tmp_path / "new", "roads", bayer_pattern="RGGB", **SHORT).main()
+    assert read_recording(tmp_path / "new").bayer_pattern == "RGGB"
+
+
+def test_the_shortest_recordings_have_frames_and_poses_enough(tmp_path):
+    trajectory = MOTIONS["shake"](4_000_000, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
+    assert sampled(trajectory, 120).times.tolist() == [0, 4_000_000]
+    Simulate(tmp_path / "new", "carpet", duration=0.1, width=16, height=12).main()
+    read = read_recording(tmp_path / "new")
+    assert read.frames is not None and len(read.frames.times) == 11

@@ -92,6 +92,12 @@ def test_passing_through_an_open_surface_is_allowed():
             check(scene, line([x, 0, 0], [x, 2, 0]))
 
 
+@pytest.mark.parametrize("way", [([0, 0, 0.2], [0, 6, 0.2]), ([0, 6, 0.2], [0, 0, 0.2])])
+def test_a_camera_that_leaves_or_enters_a_room_through_its_wall_is_refused(way):
+    with pytest.raises(RecordingError, match=r"^it: 0\.100 s after .* passes through a wall, at \(0, 3"):
+        check(scene_of(box([6, 6, 6], [0, 0, 0], inwards=True)), line(*way))
+
+
 def test_a_room_whose_faces_look_outwards_is_refused_with_what_to_do():
     with pytest.raises(RecordingError, match="if that is a room, turn its faces to look inwards"):
         check(scene_of(box([6, 6, 6], [0, 0, 0])), line([-1, 0, 0], [1, 0, 0]))

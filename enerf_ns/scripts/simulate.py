@@ -34,7 +34,7 @@ from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
 from enerf_ns.simulator.views import check_view
-from enerf_ns.simulator.writers import Setup, Writer, open_writer
+from enerf_ns.simulator.writers import FEWEST_ESIM_FRAMES, Setup, Writer, open_writer
 
 CONSOLE = Console(width=120)
 
@@ -115,7 +115,7 @@ class Simulate:
     """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
     layout: Optional[Literal["esim", "eds", "tum_vie", "event_recording"]] = None  # noqa: UP045
     """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim, and for
-    images, videos and runs this package's own."""
+    images, videos, runs and colour filters this package's own."""
     color: bool = False
     """Frames in colour, where the scene is."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
@@ -144,7 +144,13 @@ class Simulate:
                 f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
             )
         self._check_flags()
-        self.layout = self.layout or ("event_recording" if self._pictures or self.from_run else "esim")
+        self.layout = self.layout or (
+            "event_recording" if self._pictures or self.from_run or self.bayer_pattern else "esim"
+        )
+        if self.bayer_pattern and self.layout != "event_recording":
+            raise RecordingError(
+                f"--layout {self.layout} has no place for a --bayer-pattern; give --layout event_recording."
+            )
         self._check_use()
         thresholds = self.contrast_thresholds or (self._preset and self._preset.contrast_thresholds)
         if thresholds:
@@ -153,9 +159,10 @@ class Simulate:
         view = self._view(notes)
         times, exposures = self._exposures(view)
         first = view.events.brightness(view.start)
-        for flag, value in (("--color", self.color), ("--bayer-pattern", self.bayer_pattern)):
-            if value and first.ndim == 2:
-                notes.append(f"{flag} changes nothing, since {self.scene or self.from_run} is grey.")
+        if first.ndim == 2 and self.bayer_pattern:
+            raise RecordingError(f"--bayer-pattern needs colours, but {self.scene or self.from_run} is grey.")
+        if first.ndim == 2 and self.color:
+            notes.append(f"--color changes nothing, since {self.scene or self.from_run} is grey.")
         sensor = EventSensor(self.sensor, self._seen(first, view.events), view.start)
         setup = Setup(
             event_camera=view.event_camera,
@@ -198,6 +205,9 @@ class Simulate:
             soft_wrap=True,
             highlight=False,
         )
+        if view.trajectory is not None:
+            for what, command in (("look at it", "enerf inspect"), ("train", "ns-train enerf --data")):
+                CONSOLE.print(f"{what}: {command} {output_dir}", soft_wrap=True, highlight=False)
 
     def _check_flags(self) -> None:
         for flag, value, fine, expected in (
@@ -370,7 +380,8 @@ class Simulate:
         preset = self._preset
         length = view.end - view.start
         rate = preset.num_frames / preset.duration if preset else FRAME_RATE
-        count = self.num_frames or max(1, round(rate * length * 1e-9))
+        fewest = FEWEST_ESIM_FRAMES if self.layout == "esim" else 1
+        count = self.num_frames or max(fewest, round(rate * length * 1e-9))
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
             exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, length // count // 2000 * 2e-3 - 2e-3)

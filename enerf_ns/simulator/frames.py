@@ -76,8 +76,8 @@ class Exposures:
         interval = int(np.diff(times).min(initial=np.iinfo(np.int64).max))
         if not 0 <= exposure <= interval:
             raise RecordingError(
-                f"The exposure of {exposure * 1e-6:g} ms does not fit frames {interval * 1e-6:g} ms apart; give one "
-                "from 0 ms up to the time from frame to frame, or fewer frames."
+                f"The exposure of {exposure * 1e-6:g} ms does not fit frames {interval * 1e-6:g} ms apart; give "
+                "--exposure-ms from 0 up to that, or less --num-frames."
             )
         self._number = 0
         self._last: tuple[int, np.ndarray] | None = None

@@ -128,7 +128,7 @@ def sampled(trajectory: Trajectory, per_second: int) -> Trajectory:
     period = 10**9 // per_second
     if abs(np.median(np.diff(trajectory.times)) - period) < 1000:
         return trajectory
-    count = (trajectory.end - trajectory.start - period // 2) * per_second // 10**9 + 1
+    count = max(0, trajectory.end - trajectory.start - period // 2) * per_second // 10**9 + 1
     times = trajectory.start + np.arange(count) * 10**6 // per_second * 1000
     times = np.append(times, trajectory.end)
     poses = trajectory.poses(torch.from_numpy(times)).numpy()

@@ -66,6 +66,8 @@ def check_view(name: str, what: str, source: RenderedScene, start: int, end: int
 def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Trajectory, times: np.ndarray) -> None:
     """Whether a camera stays outside of all surfaces that look outwards, and are closed or nearly so.
 
+    And whether it passes from inside of those that look inwards to outside, or back.
+
     Each connected part of the triangles is looked at for itself, by its generalised winding number (Jacobson, Kavan,
     Sorkine-Hornung, SIGGRAPH 2013), since the room that a solid stands in has -1 at all places.
     """
@@ -73,14 +75,17 @@ def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Traj
     positions = _poses(trajectory, times)[:, :, 3]
     some = np.linspace(0, len(times) - 1, PLACES).astype(int)
     found = [(float(at), part) for at in some for part in parts.around(positions[at])]
-    crossings = _crossings(parts, positions)
-    stops = [*(at for at, _ in crossings), len(times) - 1.0]
+    crossings, walls = _crossings(parts, positions), []
+    stops = [0.0, *(at for at, _ in crossings), len(times) - 1.0]
     for at, part in crossings:
-        following = stops[min(bisect(stops, at + SAME_PLACE), len(crossings))]
-        found.append(((at + following) / 2, part))
+        before = (at + stops[bisect(stops, at - SAME_PLACE) - 1]) / 2
+        after = (at + stops[min(bisect(stops, at + SAME_PLACE), len(stops) - 1)]) / 2
+        found.append((after, part))
+        ends = [winding_number(parts.corners(part), _position(positions, end)) for end in (before, after)]
+        if min(ends) < -INSIDE < max(ends):
+            walls.append((at, part))
     for at, part in sorted(found):
-        position = np.array([np.interp(at, np.arange(len(times)), axis) for axis in positions.T])
-        corners = parts.corners(part)
+        position, corners = _position(positions, at), parts.corners(part)
         if winding_number(corners, position) > INSIDE:
             seconds = (np.interp(at, np.arange(len(times)), times) - times[0]) * 1e-9
             lower, upper = corners.min((0, 1)), corners.max((0, 1))
@@ -89,6 +94,12 @@ def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Traj
                 f"that looks outwards and reaches from {_shown(lower)} to {_shown(upper)} m; move the camera or what "
                 "it is in, or, if that is a room, turn its faces to look inwards (inward of a scene file's part)."
             )
+    for at, _ in walls:
+        seconds = (np.interp(at, np.arange(len(times)), times) - times[0]) * 1e-9
+        raise RecordingError(
+            f"{name}: {seconds:.3f} s after the beginning {what} passes through a wall, at "
+            f"{_shown(_position(positions, at))} m; keep it on one side of it."
+        )
 
 
 def _check_sight(name: str, what: str, source: RenderedScene, times: np.ndarray, notes: list[str]) -> None:
@@ -186,6 +197,11 @@ def _passed(
         passed = scale * (other * turned).sum(1)
     slack = 1e-9
     return np.where((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack), passed, np.nan)
+
+
+def _position(positions: Float64[np.ndarray, "positions 3"], at: float) -> Float64[np.ndarray, "3"]:
+    """Where on the way from position to position; 0.5 is halfway to the second."""
+    return np.array([np.interp(at, np.arange(len(positions)), axis) for axis in positions.T])
 
 
 def _poses(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
