@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -184,6 +185,7 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
     silences, bursts = unusual_rates(recording, statistics, depth_range)
     flag = _time_range_without(np.concatenate([gaps, jumps, silences, bursts]), statistics)
     return [
+        *_unfinished(recording.path),
         *_left_out(recording),
         *_pose_problems(recording, statistics, gaps, jumps, flag),
         *_distance_problems(recording, statistics, depth_range),
@@ -242,6 +244,15 @@ def unusual_rates(
     shifted = np.diff(np.interp(silences, edges, np.append(0.0, np.cumsum(shift))), axis=1)[:, 0]
     burst = (rate > BURST_RATIO * usual_rate) & (rate * usual_speed > BURST_RATIO * usual_rate * speed)
     return silences[shifted > MIN_SILENT_MOTION], _spans(burst & (usual_rate > 0), edges)
+
+
+def _unfinished(folder: Path) -> Iterator[Problem]:
+    settings = folder / "simulation.json"
+    if settings.is_file() and '"finished": false' in settings.read_text(errors="replace"):
+        yield Problem(
+            "The simulation of this recording was stopped before its end.",
+            "Simulate it again into a new folder, or use what there is.",
+        )
 
 
 def _left_out(recording: EventRecording) -> Iterator[Problem]:

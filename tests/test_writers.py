@@ -24,6 +24,7 @@ from recordings import joined
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.inspection import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError, load_image, read_recording
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator import writers
@@ -475,6 +476,8 @@ def test_an_interrupted_recording_holds_all_that_was_added(tmp_path: Path, layou
         raise KeyboardInterrupt
     assert check_what_is_left(layout, folder, setup, events) == (3000, 3)
     assert json.loads((folder / "simulation.json").read_text())["finished"] is False
+    problems = [problem.what for problem in find_problems(read_recording(folder))]
+    assert "The simulation of this recording was stopped before its end." in problems
 
 
 def write_and_wait(layout: str, folder: Path, written: Connection) -> None:

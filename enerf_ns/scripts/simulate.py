@@ -235,8 +235,9 @@ class Simulate:
         own_rig = rig is not None and self.cameras is None and self.from_run is None and self._pictures is None
         for applies, situation, useless in (
             (self._pictures, "for pictures, which have their size and no poses",
-             ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement",
-              "--max-change")),
+             ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement")),
+            (self._pictures and not self.sensor.cutoff_frequency, "for pictures without --cutoff-frequency",
+             ("--max-change",)),
             (self._pictures is None, "without a folder of images or a video",
              ("--frames-per-second", "--stamps", "--no-gamma")),
             (self._pictures and self._pictures.is_file(), "for a video", ("--stamps",)),
@@ -463,7 +464,8 @@ class Simulate:
         """Pictures at these times, and as many between them as motion and brightness need."""
         if isinstance(source, Pictures):
             times = np.union1d(stops, source.times[(source.times > stops[0]) & (source.times < stops[-1])])
-            yield from adaptive_renders(source.brightness, times, np.inf, threads=1)
+            max_change = max_change if self.sensor.cutoff_frequency else np.inf  # else all between is on a line
+            yield from adaptive_renders(source.brightness, times, max_change, self.sensor.log_eps, threads=1)
             return
         assert isinstance(source, RenderedScene | TrainedRun)
         for start, end in pairwise([*range(stops[0], max(stops[-1], stops[0] + 1), WINDOW), stops[-1]]):

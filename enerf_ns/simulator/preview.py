@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.simulator.frames import in_colour
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
 """R G B of pixels whose latest event was off, that had none, and whose latest was on."""
@@ -55,7 +56,7 @@ class Preview:
         height = sharp.shape[0]
         events_width = round(self._events.shape[1] * height / self._events.shape[0])
         events = cv2.resize(self._events, (events_width, height), interpolation=cv2.INTER_AREA)
-        panels = [_in_colour(sharp), None if blurred is None else _in_colour(blurred), events]
+        panels = [in_colour(sharp), None if blurred is None else in_colour(blurred), events]
         panels.append(None if depth is None else self._colour_depth(depth))
         picture = np.concatenate([panel for panel in panels if panel is not None], axis=1)
         odd_height, odd_width = height % 2, picture.shape[1] % 2  # of which the video's format can hold none
@@ -109,7 +110,3 @@ class Preview:
         return RecordingError(
             f"{self.path} could not be written as a video; make room on the disk or simulate without --preview."
         )
-
-
-def _in_colour(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)

@@ -71,6 +71,7 @@ from enerf_ns.simulator.scenes import (
     doubled_areas,
     texture_coordinates,
 )
+from enerf_ns.simulator.sources import linear_from_srgb
 from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 
 LARGEST_TEXTURE = 2048
@@ -344,7 +345,7 @@ def _piece(mesh: trimesh.Trimesh, images: dict[int, np.ndarray], is_gltf: bool) 
             instead = "no texture coordinates and shows the colours of its materials" if lacks_coordinates else ""
     elif visual.kind in ("vertex", "face"):
         colour = _fractions(visual.vertex_colors[faces] if visual.kind == "vertex" else visual.face_colors[:, None])
-        colour = colour if is_gltf else linear(colour)
+        colour = colour if is_gltf else linear_from_srgb(colour)
         of_what = "vertices" if visual.kind == "vertex" else "faces"
         instead = f"no texture coordinates and shows the colours of its {of_what}"
     colour = np.full(1, GREY) if colour is None else _one_or_three(colour)
@@ -378,16 +379,11 @@ def _one_or_three(colours: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "
     return colours[..., :1] if (colours == colours[..., :1]).all() else colours
 
 
-def linear(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Brightness of values in [0, 1] that are encoded as sRGB (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
 def linear_image(
     pixels: UInt8[np.ndarray, "height width channels"], largest: int = LARGEST_TEXTURE
 ) -> Float32[np.ndarray, "size size channels"]:
     """Linear brightness of an sRGB image, stretched to the next power of two above its longer side, or to `largest`."""
-    table = linear(np.arange(256) / 255).astype(np.float32)
+    table = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
     size = min(largest, 1 << (max(pixels.shape[:2]) - 1).bit_length())
     return textures.square(table[_one_or_three(pixels)], size)
 

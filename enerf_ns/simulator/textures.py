@@ -1,4 +1,4 @@
-"""Grey procedural textures, made from a seed: float32 [SIZE, SIZE], 0 where they are darkest, 1 where brightest."""
+"""Procedural textures, made from a seed: square, grey or in colour, 0 where they are darkest and 1 where brightest."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 SIZE = 1024
-"""Texels along one side of every texture."""
+"""Texels along one side of a texture, unless it says otherwise."""
 TEXELS_PER_METRE = 256
 EXTENT = SIZE / TEXELS_PER_METRE
-"""Metres that every texture covers before it repeats."""
+"""Metres that such a texture covers before it repeats."""
 
 Colour = Sequence[float]
 """Red, green and blue in 0 to 255."""

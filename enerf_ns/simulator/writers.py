@@ -44,7 +44,7 @@ from enerf_ns.dataparsers.calibration import Camera, check_rotation
 from enerf_ns.dataparsers.event_recording import MOUNTING_KEY, STORED_TYPES, camera_json, write_poses
 from enerf_ns.dataparsers.recording import Events, RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.frames import Frame, FrameSettings, develop
+from enerf_ns.simulator.frames import Frame, FrameSettings, develop, in_colour
 
 EVENTS_AT_A_TIME = 2**16
 """Events that are held back until they are written, and those in a chunk of an HDF5 file."""
@@ -352,9 +352,9 @@ class EsimWriter(Writer):
         return _IntervalFiles([self.folder / path for path in paths], self.setup.frame_times)
 
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
-        images = {f"images/{self._name(number)}.png": _in_colour(sharp)}
+        images = {f"images/{self._name(number)}.png": in_colour(sharp)}
         if blurred is not None:
-            images[f"images_corrupted/{self._name(number)}.png"] = _in_colour(blurred)
+            images[f"images_corrupted/{self._name(number)}.png"] = in_colour(blurred)
         return images
 
     def _stamps(self, time: int) -> dict[str, str]:
@@ -455,8 +455,8 @@ class EdsWriter(Writer):
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
         path = f"{eds.RAW_IMAGES}/frame_{number:010d}.png"
         if blurred is None:
-            return {path: _in_colour(sharp)}
-        return {path: _in_colour(blurred), f"sharp_images/{self._name(number)}.png": _in_colour(sharp)}
+            return {path: in_colour(sharp)}
+        return {path: in_colour(blurred), f"sharp_images/{self._name(number)}.png": in_colour(sharp)}
 
     def _stamps(self, time: int) -> dict[str, str]:
         return {"images_timestamps.txt": f"{int(self._to_us(np.array(time))) + EDS_START // 1000}\n"}
@@ -752,10 +752,6 @@ def _encode_npy(array: np.ndarray, dtype: type = np.float32) -> bytes:
     content = BytesIO()
     np.save(content, array.astype(dtype))
     return content.getvalue()
-
-
-def _in_colour(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
 def _json(value: dict) -> bytes:
