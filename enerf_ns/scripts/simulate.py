@@ -49,7 +49,7 @@ WINDOW = 10**9
 MOST_PIXELS = 2**24
 """Of a camera; rendering takes up to a kilobyte of memory for each."""
 
-SPARSE = 10_000_000
+SPARSE = 20_000_000
 """Nanoseconds between poses, above which they are made denser where a second camera is mounted on the first."""
 
 PUBLISHED_RIGS = {
