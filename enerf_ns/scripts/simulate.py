@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
@@ -34,7 +35,7 @@ from enerf_ns.simulator.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
 from enerf_ns.simulator.views import check_view
-from enerf_ns.simulator.writers import FEWEST_ESIM_FRAMES, Setup, Writer, open_writer
+from enerf_ns.simulator.writers import FEWEST_ESIM_FRAMES, Setup, Writer, is_second_camera, open_writer
 
 CONSOLE = Console(width=120)
 
@@ -205,7 +206,7 @@ class Simulate:
             soft_wrap=True,
             highlight=False,
         )
-        if view.trajectory is not None:
+        if view.trajectory is not None and writer.num_events:
             for what, command in (("look at it", "enerf inspect"), ("train", "ns-train enerf --data")):
                 CONSOLE.print(f"{what}: {command} {output_dir}", soft_wrap=True, highlight=False)
 
@@ -310,7 +311,7 @@ class Simulate:
                 )
         events = RenderedScene(Renderer(scene, event_camera), trajectory)
         frames = None
-        if frame_camera != event_camera or (event_from_frame != np.eye(4)).any():
+        if is_second_camera(event_camera, frame_camera, event_from_frame):
             if np.diff(trajectory.times).max() > SPARSE:
                 trajectory = sampled(trajectory, POSES_PER_SECOND)  # so that both cameras stay as they are mounted
                 events = RenderedScene(events.renderer, trajectory)
@@ -332,9 +333,7 @@ class Simulate:
             source = ImageFolder(path, self.frames_per_second, stamps, gamma=self.gamma, log_eps=self.sensor.log_eps)
         else:
             source = Video(path, self.frames_per_second, self.gamma, self.sensor.log_eps)
-        width, height = source.width, source.height
-        focal_length = width / 2 / np.tan(np.radians((self.field_of_view or FIELD_OF_VIEW) / 2))
-        camera = Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+        camera = _centred(source.width, source.height, self.field_of_view or FIELD_OF_VIEW)
         return View(source, None, None, camera, camera, np.eye(4), source.start, _until(str(path), source.end, end))
 
     def _file(self) -> Path:
@@ -364,8 +363,7 @@ class Simulate:
             usual, angle = (preset.width, preset.height), preset.field_of_view
         width = self.width or max(1, round((self.height or usual[1]) * usual[0] / usual[1]))
         height = self.height or max(1, round(width * usual[1] / usual[0]))
-        focal_length = float(width / 2 / np.tan(np.radians((self.field_of_view or angle) / 2)))
-        return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+        return _centred(width, height, self.field_of_view or angle)
 
     def _read_cameras(self) -> tuple[Camera, Camera, np.ndarray]:
         """Of events and of frames, and the pose of the latter in the axes of the former."""
@@ -385,7 +383,8 @@ class Simulate:
         count = self.num_frames or max(fewest, round(rate * length * 1e-9))
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
-            exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, length // count // 2000 * 2e-3 - 2e-3)
+            longest = max(0, length // count // 2000 - 1) * 2e-3
+            exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, longest)
         exposure = round(exposure_ms * 500) * 2000
         if count * 1000 > length or (count == 1 and exposure > length):
             raise RecordingError(
@@ -414,7 +413,7 @@ class Simulate:
             return brightness
         filters = None
         if self.bayer_pattern is not None:
-            filters = color_channels(self.bayer_pattern, source.width, source.height)
+            filters = _filters(self.bayer_pattern, source.width, source.height)
             filters = filters.view(shape) if pixels is None else filters[pixels]
         return pixel_brightness(torch.from_numpy(brightness), filters).numpy()
 
@@ -490,6 +489,15 @@ class Simulate:
 
 
 DEFAULTS = {setting.name: setting.default for setting in fields(Simulate)}
+
+
+_filters = cache(color_channels)
+
+
+def _centred(width: int, height: int, field_of_view: float) -> Camera:
+    """A pinhole camera that looks through the middle of its picture, as the ESIM layout wants it; degrees."""
+    focal_length = float(width / 2 / np.tan(np.radians(field_of_view / 2)))
+    return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 
 
 def _until(name: str, end: int, wanted: int | None) -> int:

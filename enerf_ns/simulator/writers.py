@@ -386,7 +386,7 @@ class EventRecordingWriter(Writer):
     def _write_about(self) -> None:
         setup = self.setup
         frame_camera = {**camera_json(setup.frame_camera), MOUNTING_KEY: setup.event_from_frame.tolist()}
-        is_second = setup.frame_camera != setup.event_camera or (setup.event_from_frame != np.eye(4)).any()
+        is_second = is_second_camera(setup.event_camera, setup.frame_camera, setup.event_from_frame)
         about = {
             "camera": camera_json(setup.event_camera),
             "frame_camera": frame_camera if is_second else None,
@@ -523,6 +523,11 @@ class TumVieWriter(Writer):
     @property
     def _data(self) -> str:
         return f"{TUM_VIE_SEQUENCE}-vi_gt_data"
+
+
+def is_second_camera(event_camera: Camera, frame_camera: Camera, event_from_frame: Float64[np.ndarray, "4 4"]) -> bool:
+    """Whether frames are taken by another camera, or from another place, than events."""
+    return frame_camera != event_camera or bool((event_from_frame != np.eye(4)).any())
 
 
 _WRITERS: dict[str, Callable[[Path, Setup], Writer]] = {
