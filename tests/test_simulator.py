@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -294,6 +295,13 @@ def test_layouts_of_data_sets_have_their_cameras_and_the_trajectory_that_was_ren
     if layout == "tum_vie":
         trajectory = sampled(trajectory, 120)
     times = torch.linspace(0, 2e7, 50).long()
+    if layout == "eds":
+        with h5py.File(tmp_path / "new/events.h5") as file:
+            stamps = np.loadtxt(tmp_path / "new/images_timestamps.txt")
+            assert file["t"][0] < stamps[0] and file["t"][-1] < stamps[-1]  # pyright: ignore[reportIndexIssue]
+    else:
+        (right,) = tmp_path.glob("new/*/right_images/image_timestamps_right.txt")
+        assert right.read_text() == ""
     for found, expected in (
         (read.trajectory, trajectory),
         (read.frames.trajectory, trajectory.of_mounted(event_from_frame)),

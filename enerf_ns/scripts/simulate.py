@@ -421,6 +421,9 @@ class Simulate:
         self, view: View, exposures: Exposures, sensor: EventSensor, writer: Writer, preview: Preview | None
     ) -> None:
         def add_events(events: Events) -> None:
+            if self.layout == "eds":  # of which E-NeRF's loader wants a frame that is later than the last event
+                until = np.searchsorted(events.t, exposures.times[-1] - 1000)
+                events = Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until])
             writer.add_events(events)
             if preview is not None:
                 preview.add_events(events)

@@ -491,6 +491,9 @@ class TumVieWriter(Writer):
         self._replace("camera-calibrationA.json", _json({"value0": calibration}))
         marker = {"value0": {"T_imu_marker": _pose_json(np.eye(4))}}
         self._replace("mocap-imu-calibrationA.json", _json(marker))
+        self._replace(
+            f"{self._data}/right_images/image_timestamps_right.txt", b""
+        )  # without which E-NeRF does not load
 
     def _write_poses(self, trajectory: Trajectory) -> None:
         times = np.unique(self._to_us(trajectory.times))
