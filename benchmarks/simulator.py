@@ -15,10 +15,10 @@ import numpy as np
 import torch
 import tyro
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.trajectories import MOTIONS
 
 SENSORS = {

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from rich.progress import track
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 

@@ -19,7 +19,10 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.depth_range import estimate_depth_range
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, read_recording
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
@@ -122,7 +125,7 @@ class EventDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         try:
             return self.outputs(self.recording(), split)
-        except RecordingError as error:
+        except UserError as error:
             raise SystemExit(f"enerf: {error}") from error
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
@@ -175,7 +178,7 @@ def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tup
     chosen = config.depth_range or recording.depth_range
     if chosen is None:
         try:
-            events = recording.index.events(at_most=EVENTS_FOR_DEPTH)
+            events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
             chosen = estimate_depth_range(events, recording.camera, recording.trajectory)
         except ValueError as error:
             raise RecordingError(

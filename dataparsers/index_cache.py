@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from enerf_ns.dataparsers.events import EventIndex, EventStream, Survey, sorted_bands
+from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
 from enerf_ns.user_cache import user_cache_folder
 
 LAYOUT = 2

@@ -17,11 +17,12 @@ from tyro.conf import OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.event_camera import color_channels
 from enerf_ns.event_dataset import EventDataset
-from enerf_ns.event_sampler import EventPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
 from enerf_ns.ray_samplers import PairedRayBundle
+from enerf_ns.sensor.response import color_channels
 
 EventDataParserUnion = OmitSubcommandPrefixes[
     subcommand_type_from_defaults(
@@ -83,8 +84,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def setup_events(self, recording: EventRecording) -> None:
         """Index the events on the device, and what turns pixels and times into rays."""
         config, camera = self.config, recording.camera
-        assert config.pair_mode is not None, "enerf_ns.scene_choices fills it in"
-        index = recording.index.to(self.device)
+        assert config.pair_mode is not None, "enerf_ns.choices fills it in"
+        index = index_events(recording).to(self.device)
         self.silent_sampler = None
         try:
             self.pair_sampler = EventPairSampler(
@@ -96,7 +97,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 refractory_ns=recording.refractory_period,
             )
             if config.silent_pairs:
-                first, last = recording.index.span
+                first, last = index_events(recording).span
                 silence = round(config.silence_ms * 1e6)
                 self.silent_sampler = SilentPixelSampler(
                     index, first, last, silence, silence, recording.refractory_period

@@ -24,9 +24,9 @@ from torch.nn import Parameter
 
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
-from enerf_ns.event_camera import linlog, luma, measured_change, pixel_brightness
-from enerf_ns.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 from enerf_ns.ray_samplers import SharedJitter
+from enerf_ns.sensor.response import linlog, luma, measured_change, pixel_brightness
+from enerf_ns.supervision.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 
 
 @dataclass
@@ -106,7 +106,7 @@ class EnerfModel(Model):
         config = self.config
         assert (
             config.contrast_thresholds and config.max_res and config.num_channels and config.near_plane is not None
-        ), "enerf_ns.scene_choices fills in what the config leaves open before the model is built"
+        ), "enerf_ns.choices fills in what the config leaves open before the model is built"
         aabb = self.scene_box.aabb
         self.collider = BoxCollider(self.scene_box, config.near_plane)
         self.field = EnerfField(

@@ -12,12 +12,14 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
+from enerf_ns.choices import Choice, absolute, fill_in_choices
+from enerf_ns.dataparsers.errors import RecordingError, UserError
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, scene_normalisation
-from enerf_ns.dataparsers.inspection import find_problems
-from enerf_ns.dataparsers.recording import EventRecording, RecordingError
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import find_problems
+from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
-from enerf_ns.presets import PresetName, apply_preset
-from enerf_ns.scene_choices import Choice, absolute, fill_in_choices
+from enerf_ns.paper_selections import PresetName, apply_preset
 
 
 @dataclass
@@ -57,14 +59,14 @@ class EnerfTrainerConfig(TrainerConfig):
             selection = apply_preset(self, METHODS[self.method_name], recording)
             recording = EventDataParser(manager.dataparser).recording()
         choices = fill_in_choices(self.pipeline, recording)
-        recording.index  # noqa: B018 - reads and checks the events
+        index_events(recording)
         return recording, selection, choices
 
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""
         try:
             recording, selection, choices = self.prepare()
-        except RecordingError as error:
+        except UserError as error:
             raise SystemExit(f"enerf: {error}") from error
         CONSOLE.print(recording_table(recording, self))
         for line in selection:
@@ -99,7 +101,7 @@ class EnerfTrainer(Trainer):
 
 def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Table:
     """What the recording holds."""
-    index, camera = recording.index, recording.camera
+    index, camera = index_events(recording), recording.camera
     first, last = index.span
     seconds = max(last - first, 1) * 1e-9
     parser = config.pipeline.datamanager.dataparser
@@ -126,7 +128,7 @@ def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Ta
     table = Table(title="Recording", show_header=False, title_justify="left")
     for name, value in rows.items():
         table.add_row(name, value)
-    for note in recording.notes:
+    for note in (*recording.notes, *index.notes):
         table.add_row("note", f"[yellow]{note}[/yellow]")
     for problem in find_problems(recording, depth):
         table.add_row("[red]problem[/red]", f"[red]{problem.what}[/red] {problem.advice}")

@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from enerf_ns.dataparsers.events import event_picture
-from enerf_ns.dataparsers.recording import EventRecording, Frames, load_array, load_image
+from enerf_ns.dataparsers.event_index import event_picture
+from enerf_ns.dataparsers.files import load_array, load_image
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 
 class EventDataset(InputDataset):
@@ -23,7 +25,7 @@ class EventDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """Picture of shape (height, width, 3), uint8."""
         if not self.are_frames:
-            return event_picture(self.recording.index, self.recording.camera, int(self.frames.times[image_idx]))
+            return event_picture(index_events(self.recording), self.recording.camera, int(self.frames.times[image_idx]))
         image = self.frames.camera.undistort(load_image(self.frames.filenames[image_idx]))
         return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 

@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 from recordings import HEIGHT, WIDTH, write_davis, write_esim, write_image
 
-from enerf_ns.dataparsers.recording import RecordingError, load_array, load_image, read_recording
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_array, load_image
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
 
 
 @dataclass
@@ -334,7 +337,7 @@ def contents(folder: Path) -> dict[str, tuple[str, int]]:
 def read_all(folder: Path, format: str) -> None:
     """Reads everything that a recording refers to."""
     recording = read_recording(folder, format)
-    len(recording.index.events())
+    len(index_events(recording).events())
     for frames in (recording.frames, recording.blurred_frames):
         for file in frames.filenames if frames else ():
             load_image(file)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera, check_rotation
+from enerf_ns.dataparsers.camera import Camera, check_rotation
 
 PINHOLE = Camera(12, 10, 20.0, 21.0, 6.0, 4.5)
 RADTAN = Camera(

@@ -14,15 +14,17 @@ from nerfstudio.scripts.train import _set_random_seed
 from PIL import Image
 from recordings import joined
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.choices import fill_in_choices
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.evaluation.metrics import align_channels
-from enerf_ns.event_camera import inverse_linlog, linlog
-from enerf_ns.scene_choices import fill_in_choices
+from enerf_ns.sensor.response import inverse_linlog, linlog
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 32.0
@@ -247,9 +249,9 @@ def test_the_refractory_period_reaches_the_sampler_and_the_table(recording: Even
     assert "8 ms" in why and ("successor" in why) == approximate
     manager = config.setup(device="cpu").datamanager
     pairs = manager.pair_sampler.sample(1000, torch.Generator().manual_seed(0))
-    after_event = torch.isin(pairs.start - 8_000_000, recording.index.times)
+    after_event = torch.isin(pairs.start - 8_000_000, index_events(recording).times)
     assert (after_event | (pairs.start == pairs.end - 1)).all() and after_event.any()
     silent = manager.silent_sampler.sample(1000, torch.Generator().manual_seed(0))
-    before = recording.index.count_until(silent.pixels, silent.start)
-    latest = recording.index.times[recording.index.offsets[silent.pixels] + before - 1]
+    before = index_events(recording).count_until(silent.pixels, silent.start)
+    latest = index_events(recording).times[index_events(recording).offsets[silent.pixels] + before - 1]
     assert (silent.start - latest >= 8_000_000)[before > 0].all()

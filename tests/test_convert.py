@@ -18,8 +18,11 @@ from recordings import EVENTS, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis, wr
 from test_event_files import BAD, FORMATS, events
 from test_event_recording import CAMERA, all_events, copied, same_recording, write_recording
 
-from enerf_ns.dataparsers import event_recording
-from enerf_ns.dataparsers.recording import Events, RecordingError, read_recording
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.scripts.convert import Convert
 
 FILE_CAMERA = {**CAMERA, "width": 640, "height": 480}
@@ -139,7 +142,7 @@ def test_an_event_file_with_poses_and_calibration(
     np.testing.assert_array_equal(recording.trajectory.times, times - rows[0, 0] * 1000)
     np.testing.assert_array_equal(recording.trajectory.positions, poses()[:, :3])
     assert recording.camera.distortion == (-0.01, 0.002, 1 / 3000, 0) and recording.camera.fx == 400.5
-    assert len(recording.index) == len(rows)
+    assert len(index_events(recording)) == len(rows)
     assert "Before training" not in capsys.readouterr().out
 
 

@@ -10,9 +10,12 @@ import pytest
 import torch
 from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, joined, poses, write_davis
 
-from enerf_ns.dataparsers import davis
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import EventRecording, load_image, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats import davis
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording
 
 EPOCH = 1_468_939_802_123_456_789
 """An absolute time in ns; float64 seconds would round it to 0.2 microseconds."""
@@ -21,7 +24,7 @@ EPOCH = 1_468_939_802_123_456_789
 @pytest.mark.parametrize("zero", [0, EPOCH])
 def test_reads_what_was_written(tmp_path: Path, zero: int):
     recording = read_recording(write_davis(tmp_path / "davis", zero=zero))
-    events, trajectory = recording.index.events(), recording.trajectory
+    events, trajectory = index_events(recording).events(), recording.trajectory
     np.testing.assert_array_equal(np.stack([events.x, events.y, events.t, events.p], axis=1), EVENTS)
     np.testing.assert_array_equal(trajectory.times, POSE_TIMES)
     np.testing.assert_allclose(np.column_stack([trajectory.positions, trajectory.quaternions]), poses(), atol=1e-15)
@@ -30,7 +33,7 @@ def test_reads_what_was_written(tmp_path: Path, zero: int):
     assert recording.camera == Camera(
         WIDTH, HEIGHT, 330.0, 340.0, 11.5, 8.5, (-0.14, 0.09, -0.0003, 0.0002, 0.0), "radtan"
     )
-    assert recording.notes == []
+    assert list(recording.notes) == []
 
 
 def test_the_zero_of_time_is_the_earliest_first_stamp(tmp_path: Path):
@@ -39,7 +42,7 @@ def test_the_zero_of_time_is_the_earliest_first_stamp(tmp_path: Path):
     (folder / "events.txt").write_text("4.900000000 1 1 1\n" + lines)
     recording = read_recording(folder)
     assert recording.trajectory.start == 100_000_000
-    assert recording.index.events().t[0] == EVENTS[0, 2] + 100_000_000
+    assert index_events(recording).events().t[0] == EVENTS[0, 2] + 100_000_000
 
 
 def test_without_frames_the_sensor_is_the_davis240c(tmp_path: Path):
@@ -55,7 +58,7 @@ def test_a_list_of_frames_without_the_folder_of_images_means_no_frames(tmp_path:
     (folder / "images").rmdir()
     recording = read_recording(folder)
     assert recording.frames is None
-    assert recording.notes == ["images.txt lists 3 frames, but there is no folder images/ of images."]
+    assert list(recording.notes) == ["images.txt lists 3 frames, but there is no folder images/ of images."]
 
 
 def test_a_calibration_without_distortion_is_a_pinhole_camera(tmp_path: Path):
@@ -71,7 +74,7 @@ def test_line_ends_and_separators(tmp_path: Path, end: str, separator: str):
     text = (folder / "events.txt").read_text().rstrip("\n").replace(" ", separator)
     text = text.replace("\n", "\r\n") if end == "\r\n" else text
     (folder / "events.txt").write_bytes((text + end).encode())
-    assert len(read_recording(folder).index.events()) == len(EVENTS)
+    assert len(index_events(read_recording(folder)).events()) == len(EVENTS)
 
 
 def test_event_times_are_exact_however_they_are_written(tmp_path: Path):
@@ -111,10 +114,10 @@ def test_slider_depth_holds_what_its_files_hold(slider: EventRecording):
     expected = np.column_stack([np.rint(table[:, 0] * 1e9), table[:, 1:]])
     np.testing.assert_array_equal(np.column_stack([raw.t, raw.x, raw.y, raw.p])[:10_000], expected)
 
-    assert len(slider.index.events()) == np.count_nonzero((raw.t >= 22_291_582) & (raw.t <= 3_402_486_198))
+    assert len(index_events(slider).events()) == np.count_nonzero((raw.t >= 22_291_582) & (raw.t <= 3_402_486_198))
     assert slider.frames is not None and len(slider.frames.times) == 86
     assert slider.notes[0] == "1 of 87 frames (1.1 %) lie outside the poses and are left out."
-    assert "of 1,078,541 events (0.32 %) lie outside the poses" in slider.notes[1]
+    assert "of 1,078,541 events (0.32 %) lie outside the poses" in index_events(slider).notes[0]
 
 
 def test_slider_depth_poses(slider: EventRecording):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import estimate_depth_range
-from enerf_ns.dataparsers.recording import Events, read_recording
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
@@ -104,5 +106,5 @@ def test_events_without_structure_are_refused():
 def test_slider_depth(shared_data: Path):
     """Its authors state depths of 0.45 to 2.07 m."""
     recording = read_recording(shared_data / "slider_depth")
-    near, far = estimate_depth_range(recording.index.events(), recording.camera, recording.trajectory)
+    near, far = estimate_depth_range(index_events(recording).events(), recording.camera, recording.trajectory)
     assert 0.2 < near < 0.45 and 2.07 < far < 4.0

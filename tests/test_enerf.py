@@ -16,13 +16,13 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from enerf_ns.dataparsers.recording import load_image
+from enerf_ns.dataparsers.files import load_image
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.event_camera import luma
 from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.sensor.response import luma
 
 WIDTH, HEIGHT = 32, 24
 

@@ -24,9 +24,10 @@ from test_esim_npz import (
     write_views,
 )
 
-from enerf_ns.dataparsers import esim_bag, esim_npz
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats import esim_bag, esim_npz
+from enerf_ns.dataparsers.indexing import index_events
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="rosbags is an optional extra of the project")
 typesys = pytest.importorskip("rosbags.typesys")
@@ -153,8 +154,8 @@ def test_reads_what_was_written(tmp_path: Path, model: str, compression: str | N
     assert recording.refractory_period == 8_000_000
     assert recording.bayer_pattern == "RGGB"
     assert recording.frames is recording.blurred_frames is recording.held_out_frames is None
-    assert recording.notes == []
-    assert len(recording.index) == NUM_EVENTS
+    assert list(recording.notes) == []
+    assert len(index_events(recording)) == NUM_EVENTS
 
 
 def test_bag_and_npz_of_a_recording_are_the_same(tmp_path: Path):
@@ -197,7 +198,7 @@ def test_poses_that_come_late_or_twice_are_mended(tmp_path: Path):
     twice = esim_bag.POSES, poses[30][1], poses[30][2]
     write_bag(folder / "esim.bag", [camera_info(), *poses[:7], *poses[8:], late, twice, *event_arrays()])
     recording = esim_bag.read(folder)
-    assert recording.notes == [
+    assert list(recording.notes) == [
         "The poses in esim.bag go back in time 1 times and are sorted.",
         "1 of 41 poses in esim.bag follow another one within 1 µs and are left out.",
     ]
@@ -341,7 +342,7 @@ def test_bad_input_gives_one_clear_sentence(tmp_path: Path, name: str):
     folder = write_recording(tmp_path / "easy")
     break_it(folder)
     with pytest.raises(RecordingError) as error:
-        len(esim_bag.read(folder).index)
+        len(index_events(esim_bag.read(folder)))
     text = str(error.value)
     assert message in text and str(folder) in text
     assert text.endswith(".") and "\n" not in text and not re.search(r"[a-z\d)]\. [A-Z]", text)

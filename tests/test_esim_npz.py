@@ -18,9 +18,12 @@ from PIL import Image
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers import esim_npz
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import EventRecording, RecordingError, load_image
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats import esim_npz
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0.0, 80.5], [0.0, 152.0, 58.5], [0.0, 0.0, 1.0]])
@@ -158,8 +161,8 @@ def test_reads_what_was_written(tmp_path: Path, model: str, save: Callable):
     assert recording.bayer_pattern == "RGGB"
     assert recording.frames is recording.blurred_frames is recording.held_out_frames is None
     assert recording.num_events == NUM_EVENTS
-    assert recording.notes == []
-    assert len(recording.index) == NUM_EVENTS
+    assert list(recording.notes) == []
+    assert len(index_events(recording)) == NUM_EVENTS
 
 
 @pytest.mark.parametrize(
@@ -286,7 +289,7 @@ def test_views_show_known_points(tmp_path: Path, beside: bool, split: str, mode:
             seen = pose[:, :3].T @ (point - pose[:, 3])
             pixel = (frames.camera.matrix @ (seen / seen[2]))[:2]
             assert np.linalg.norm(spot_centre(load_image(file), pixel) - pixel) < 0.05
-    assert recording.notes == []
+    assert list(recording.notes) == []
 
 
 def test_views_with_intrinsics(tmp_path: Path):
@@ -584,7 +587,7 @@ def test_bad_input_gives_one_clear_sentence(tmp_path: Path, name: str):
     write_views(folder / "views")
     break_it(folder)
     with pytest.raises(RecordingError) as error:
-        len(esim_npz.read(folder).index)
+        len(index_events(esim_npz.read(folder)))
     text = str(error.value)
     assert message in text and str(folder) in text
     assert text.endswith(".") and "\n" not in text and not re.search(r"[a-z\d)]\. [A-Z]", text)

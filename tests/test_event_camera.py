@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns.event_camera import (
+from enerf_ns.sensor.response import (
     DEFAULT_CONTRAST_THRESHOLD,
     color_channels,
     inverse_linlog,

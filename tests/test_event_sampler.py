@@ -11,11 +11,11 @@ import torch
 from scipy.optimize import root_scalar
 from scipy.stats import chisquare
 
-from enerf_ns import event_sampler
-from enerf_ns.dataparsers.events import EventIndex
+from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
-from enerf_ns.event_camera import measured_change
-from enerf_ns.event_sampler import EventPairs, EventPairSampler, SilentPixelSampler
+from enerf_ns.events import samplers as event_sampler
+from enerf_ns.events.samplers import EventPairs, EventPairSampler, SilentPixelSampler
+from enerf_ns.sensor.response import measured_change
 
 WIDTH, HEIGHT = 5, 4
 MODES = ["successor", "partner", "window"]

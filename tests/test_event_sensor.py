@@ -17,7 +17,8 @@ from recordings import joined
 from scipy.optimize import brentq
 from scipy.stats import kstest
 
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.simulator.event_sensor import (
     CUT_JITTER,
     READOUT_QUEUE,

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.ndimage import median_filter
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.events import EventIndex, event_picture, sorted_bands, survey_events
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.event_index import EventIndex, event_picture, sorted_bands, survey_events
 from enerf_ns.dataparsers.recording import Events
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings, develop
 
 MS = 1_000_000

@@ -34,16 +34,12 @@ from recordings import HEIGHT, WIDTH, joined, seconds, write_davis, write_esim
 from scipy.spatial.transform import Rotation
 from test_bad_input import contents, is_one_sentence
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import (
-    EventRecording,
-    Frames,
-    RecordingError,
-    _read_recording,
-    load_array,
-    load_image,
-    read_recording,
-)
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_array, load_image
+from enerf_ns.dataparsers.formats.registry import _read_recording, read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 # ------------------------------------------------------------------------------------------------- what is damaged
@@ -638,7 +634,7 @@ def facts(recording: EventRecording) -> dict[str, Any]:
     events = joined(recording.stream_events())
     return {
         "events": np.stack([events.x, events.y, events.t, events.p], axis=1).astype(np.int64),
-        "index": [getattr(recording.index, name).numpy() for name in ("times", "positives", "offsets")],
+        "index": [getattr(index_events(recording), name).numpy() for name in ("times", "positives", "offsets")],
         "camera": (recording.camera, recording.camera.directions),
         "trajectory": of_trajectory(recording.trajectory),
         "frames": [of_frames(frames) for frames in kinds_of_frames(recording)],
@@ -674,7 +670,7 @@ def check_trajectory(trajectory: Trajectory) -> None:
 
 def check_index(recording: EventRecording, rows: np.ndarray) -> None:
     """The index holds the events within the poses, but for hot pixels."""
-    camera, trajectory, index = recording.camera, recording.trajectory, recording.index
+    camera, trajectory, index = recording.camera, recording.trajectory, index_events(recording)
     x, y, t, p = rows.T
     assert ((x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)).all()
     assert (np.diff(t) >= 0).all()
@@ -685,7 +681,7 @@ def check_index(recording: EventRecording, rows: np.ndarray) -> None:
     events = index.events()
     found = np.stack([events.x, events.y, events.t, events.p], axis=1).astype(np.int64)
     np.testing.assert_array_equal(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)])
-    assert len(found) == len(rows) or any("events" in sentence for sentence in recording.notes)
+    assert len(found) == len(rows) or any("events" in sentence for sentence in index_events(recording).notes)
 
 
 def check_plain(recording: EventRecording, rows: np.ndarray, plain: Plain) -> None:

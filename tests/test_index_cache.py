@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ import pytest
 import torch
 
 from enerf_ns.dataparsers import index_cache
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.events import EventIndex
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
@@ -56,7 +58,7 @@ def recording(source: Path, end: int = 10**9) -> EventRecording:
 
     passes: list[int] = []
     made = EventRecording(source, "test", Camera(WIDTH, HEIGHT, 20, 20, 16, 12), trajectory, stream, (source,))
-    made.passes = passes  # type: ignore[attr-defined]
+    object.__setattr__(made, "passes", passes)
     return made
 
 
@@ -72,32 +74,32 @@ def assert_equal(one: EventIndex, other: EventIndex) -> None:
 
 def test_the_second_start_reads_the_index_and_not_the_events(source: Path, cache: Path):
     first, second = recording(source, 900_000_000), recording(source, 900_000_000)
-    assert_equal(first.index, second.index)
+    assert_equal(index_events(first), index_events(second))
     assert len(first.passes) == 2 and not second.passes  # type: ignore[attr-defined]
-    assert first.notes == second.notes and "lie outside the poses" in first.notes[0]
+    notes = index_events(first).notes
+    assert notes == index_events(second).notes and "lie outside the poses" in notes[0]
     assert len(entries(cache)) == 1
-    assert_equal(second.index, EventIndex.from_events(first.index.events(), WIDTH, HEIGHT))
+    assert_equal(index_events(second), EventIndex.from_events(index_events(first).events(), WIDTH, HEIGHT))
 
 
 def test_what_changes_the_index_changes_the_entry(source: Path, cache: Path):
-    recording(source).index.span  # noqa: B018
-    assert recording(source, end=500_000_000).index.span[1] <= 500_000_000
-    chosen = recording(source)
-    chosen.select((0.25, 0.5), keep_hot_pixels=False)
-    assert chosen.index.span[0] >= 250_000_000 and chosen.index.span[1] <= 500_000_000
+    index_events(recording(source)).span  # noqa: B018
+    assert index_events(recording(source, end=500_000_000)).span[1] <= 500_000_000
+    chosen = recording(source).selected((0.25, 0.5), keep_hot_pixels=False)
+    assert index_events(chosen).span[0] >= 250_000_000 and index_events(chosen).span[1] <= 500_000_000
     assert len(entries(cache)) == 3
 
     columns = np.load(source)
     columns[2] += 1000
     np.save(source, columns)
-    assert recording(source, end=2 * 10**9).index.span == (columns[2, 0], columns[2, -1])
+    assert index_events(recording(source, end=2 * 10**9)).span == (columns[2, 0], columns[2, -1])
     assert len(entries(cache)) == 4
 
 
 @pytest.mark.parametrize("column", ["times", "positives", "counts", "index.json"])
 @pytest.mark.parametrize("damage", ["shorter", "other bytes", "gone"])
 def test_a_damaged_entry_is_noticed_and_made_again(source: Path, cache: Path, column: str, damage: str):
-    good = recording(source).index
+    good = index_events(recording(source))
     times = good.times.clone()
     file = cache / entries(cache)[0] / column
     content = file.read_bytes()
@@ -107,9 +109,9 @@ def test_a_damaged_entry_is_noticed_and_made_again(source: Path, cache: Path, co
     elif damage == "other bytes":
         file.write_bytes(bytes(len(content)))
     again = recording(source)
-    assert torch.equal(again.index.times, times)
+    assert torch.equal(index_events(again).times, times)
     assert len(again.passes) == 2 and len(entries(cache)) == 1  # type: ignore[attr-defined]
-    assert not recording(source).index.times.equal(torch.zeros_like(times))
+    assert not index_events(recording(source)).times.equal(torch.zeros_like(times))
 
 
 def test_a_killed_process_leaves_no_entry_and_its_remains_are_removed_later(source: Path, cache: Path):
@@ -117,12 +119,13 @@ def test_a_killed_process_leaves_no_entry_and_its_remains_are_removed_later(sour
 import os, sys
 from pathlib import Path
 from enerf_ns.dataparsers import index_cache
+from enerf_ns.dataparsers.indexing import index_events
 sys.path.insert(0, sys.argv[2])
 from test_index_cache import recording
 index_cache.CACHED_FROM = 1
 real = index_cache.os.fsync
 index_cache.os.fsync = lambda number: (print("writing", flush=True), sys.stdin.read())
-recording(Path(sys.argv[1])).index
+index_events(recording(Path(sys.argv[1])))
 """
     arguments = [sys.executable, "-c", program, str(source), str(Path(__file__).parent)]
     process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -133,7 +136,7 @@ recording(Path(sys.argv[1])).index
     assert left_behind.startswith(".partial-")
     long_ago = time.time() - 2 * index_cache.STALE_SECONDS
     os.utime(cache / left_behind, (long_ago, long_ago))
-    recording(source).index.span  # noqa: B018
+    index_events(recording(source)).span  # noqa: B018
     (entry,) = entries(cache)
     assert entry != left_behind
 
@@ -142,7 +145,7 @@ def _build(source: Path, cache: Path, barrier, results) -> None:
     os.environ["ENERF_CACHE"] = str(cache)
     index_cache.CACHED_FROM = 1
     barrier.wait()
-    index = recording(source).index
+    index = index_events(recording(source))
     results.put((len(index), int(index.times.sum() % 10**9)))
 
 
@@ -162,8 +165,9 @@ def test_two_processes_at_once_do_no_harm(source: Path, cache: Path):
 def test_a_folder_that_cannot_be_written_costs_the_cache_and_nothing_else(source: Path, cache: Path):
     cache.write_text("a file, where a folder was expected")
     made = recording(source)
-    assert len(made.index) == NUM_EVENTS
-    assert "could not be stored in" in made.notes[0] and "ENERF_CACHE" in made.notes[0]
+    assert len(index_events(made)) == NUM_EVENTS
+    (note,) = index_events(made).notes
+    assert "could not be stored in" in note and "ENERF_CACHE" in note
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -173,34 +177,33 @@ def test_a_full_disk_costs_the_cache_and_nothing_else(source: Path, cache: Path,
         "builtins.open", lambda path, *mode: opened("/dev/full" if str(path).endswith("/times") else path, *mode)
     )
     made = recording(source)
-    assert len(made.index) == NUM_EVENTS
-    assert "No space left on device" in made.notes[0]
+    assert len(index_events(made)) == NUM_EVENTS
+    assert "No space left on device" in index_events(made).notes[0]
     assert entries(cache) == []
 
 
 @pytest.mark.parametrize("bands", [1, 2, 7])
 def test_bands_of_pixels_make_the_same_index(source: Path, cache: Path, bands: int, monkeypatch: pytest.MonkeyPatch):
-    whole = recording(source).index
+    whole = index_events(recording(source))
     shutil.rmtree(cache)
     monkeypatch.setattr(index_cache, "_physical_memory", lambda: 4 * 12 * (NUM_EVENTS // bands + 100))
     banded = recording(source)
-    assert_equal(banded.index, whole)
+    assert_equal(index_events(banded), whole)
     assert len(banded.passes) >= 1 + bands  # type: ignore[attr-defined]
 
 
 def test_a_file_that_changes_between_the_passes_is_an_error(source: Path):
-    made = recording(source)
     columns = np.load(source)
     moved = columns.copy()
     moved[0] = (moved[0] + 1) % WIDTH
     contents = iter([columns, columns, moved])
-    made.stream_events = lambda: iter([Events(*next(contents))])
+    made = replace(recording(source), stream_events=lambda: iter([Events(*next(contents))]))
     with pytest.raises(ValueError, match=r"events\.npy changed while it was read"):
-        made.index  # noqa: B018
+        index_events(made)
 
 
 def test_the_entry_is_plain_data(source: Path, cache: Path):
-    index = recording(source).index
+    index = index_events(recording(source))
     folder = cache / entries(cache)[0]
     assert np.array_equal(np.fromfile(folder / "times", np.int64), index.times)
     assert json.loads((folder / "index.json").read_text())["survey"]["num_events"] == NUM_EVENTS

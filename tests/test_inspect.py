@@ -20,10 +20,13 @@ from rich.console import Console
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.events import event_picture
-from enerf_ns.dataparsers.inspection import find_problems
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.event_index import event_picture
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import find_problems
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.scripts import inspect
 from enerf_ns.scripts.inspect import Inspect, Inspection
@@ -95,7 +98,7 @@ def test_the_page_shows_each_frame_beside_the_events_of_its_time_both_undistorte
         new_matrix = cv2.getOptimalNewCameraMatrix(matrix, coefficients, (WIDTH, HEIGHT), 0.0)[0]
         expected = cv2.undistort(image(i), matrix, coefficients, newCameraMatrix=new_matrix)
         np.testing.assert_array_equal(page.picture(f"frame at {seconds(time)}"), as_jpeg(expected))
-        events = event_picture(recording.index, recording.camera, time)
+        events = event_picture(index_events(recording), recording.camera, time)
         np.testing.assert_array_equal(page.picture(f"events at {seconds(time)}"), events)
         assert f"frame_{i:08d}.png" in page.text
     assert len(page.images) == 2 * len(FRAME_TIMES) + 3

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers import inspection
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.inspection import event_statistics, find_problems, pose_gaps, unusual_rates
+from enerf_ns.dataparsers import problems as inspection
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import event_statistics, find_problems, pose_gaps, unusual_rates
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
@@ -251,7 +252,7 @@ def test_statistics_against_slow_loops(at_once: int, monkeypatch: pytest.MonkeyP
 def test_a_sample_of_the_events_gives_their_rate():
     recording = made()
     sampled = event_statistics(recording, at_most=5000)
-    taken = recording.index.times[::5].numpy()  # 23,040 events
+    taken = index_events(recording).times[::5].numpy()  # 23,040 events
     expected = 5 * np.histogram(taken, sampled.edges)[0] / (np.diff(sampled.edges) * 1e-9)
     np.testing.assert_allclose(sampled.rate, expected, rtol=1e-9)
     assert len(sampled.rate) == len(taken) // 200

@@ -9,7 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
-from enerf_ns.event_camera import inverse_linlog, linlog
+from enerf_ns.sensor.response import inverse_linlog, linlog
 
 
 def pictures(count: int, seed: int = 0) -> list[Tensor]:

@@ -28,7 +28,7 @@ WITHOUT_NERFSTUDIO = [
     for module in MODULES
     if module.startswith(("enerf_ns.encodings", "enerf_ns.simulator", "enerf_ns.dataparsers"))
     and module != "enerf_ns.dataparsers.event_dataparser"
-] + ["enerf_ns.event_sampler", "enerf_ns.event_camera", "enerf_ns.losses", "enerf_ns.ffmpeg"]
+] + ["enerf_ns.events.samplers", "enerf_ns.sensor.response", "enerf_ns.supervision.losses", "enerf_ns.ffmpeg"]
 
 
 def run_python(code: str, python: str | Path = sys.executable) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,15 @@ import pytest
 import torch
 from recordings import write_esim
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import Frames, RecordingError, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording import Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.losses import event_loss, no_event_loss
-from enerf_ns.presets import PRESETS, Preset, PresetName, apply_preset, event_time_range
+from enerf_ns.paper_selections import PRESETS, Preset, PresetName, apply_preset, event_time_range
+from enerf_ns.supervision.losses import event_loss, no_event_loss
 
 PAPER: Any = enerf_paper.config
 TUNED: Any = enerf.config
@@ -215,9 +218,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def replace_frames(recording: Any, frames: Frames | None) -> Any:
-    recording = copy.copy(recording)
-    recording.frames, recording.blurred_frames = frames, None
-    return recording
+    return replace(recording, frames=frames, blurred_frames=None)
 
 
 def selections(config: EnerfTrainerConfig) -> dict[str, Any]:

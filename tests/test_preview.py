@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.simulator.preview import NO_COLOUR, OFF_COLOUR, ON_COLOUR, Preview
 
 WIDTH, HEIGHT = 64, 48

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,12 @@ import pytest
 from PIL import Image
 from recordings import HEIGHT, WIDTH, write_davis, write_esim
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError, load_image, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 20.0, 12.0, 9.0)
@@ -24,7 +29,7 @@ def recording(columns: np.ndarray, start: int = 0, end: int = 100, frame_times: 
 
 
 def test_events_have_the_types_that_everything_builds_on():
-    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]])).index.events()
+    events = index_events(recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]]))).events()
     assert [column.dtype for column in (events.x, events.y, events.t, events.p)] == [
         np.uint16, np.uint16, np.int64, np.int8,
     ]  # fmt: skip
@@ -38,22 +43,23 @@ def test_events_have_the_types_that_everything_builds_on():
 def test_polarities_become_plus_and_minus_one(off: int, dtype: type):
     events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [1, 2, 7, 1]]))
     (raw,) = events.stream_events()
-    events.stream_events = lambda: iter([Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))])
-    assert events.index.events().p.tolist() == [-1, 1, -1]
+    signed = Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))
+    events = replace(events, stream_events=lambda: iter([signed]))
+    assert index_events(events).events().p.tolist() == [-1, 1, -1]
 
 
 def test_events_of_one_polarity_only_are_fine():
-    assert recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]])).index.events().p.tolist() == [1, 1]
-    assert recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]])).index.events().p.tolist() == [-1, -1]
+    assert index_events(recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]]))).events().p.tolist() == [1, 1]
+    assert index_events(recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]]))).events().p.tolist() == [-1, -1]
 
 
 def test_events_outside_the_poses_are_dropped_and_counted():
     times = np.array([9, 10, 10, 50, 100, 101])
     rows = np.column_stack([np.full_like(times, 3), np.full_like(times, 4), times, np.ones_like(times)])
     clipped = recording(rows, start=10)
-    assert clipped.index.events().t.tolist() == [10, 10, 50, 100]
-    assert clipped.notes == ["2 of 6 events (33 %) lie outside the poses and are left out."]
-    assert clipped.index is clipped.index
+    assert index_events(clipped).events().t.tolist() == [10, 10, 50, 100]
+    assert index_events(clipped).notes == ("2 of 6 events (33 %) lie outside the poses and are left out.",)
+    assert index_events(clipped) is index_events(clipped)
 
 
 def test_frames_outside_the_poses_are_dropped_and_counted():
@@ -62,13 +68,13 @@ def test_frames_outside_the_poses_are_dropped_and_counted():
     assert clipped.frames is not None and clipped.frames.times.tolist() == [10, 100]
     assert clipped.frames.filenames == (Path("10.png"), Path("100.png"))
     assert clipped.frames.depth_filenames == (Path("10.npy"), Path("100.npy"))
-    assert clipped.notes == ["2 of 4 frames (50 %) lie outside the poses and are left out."]
+    assert clipped.notes == ("2 of 4 frames (50 %) lie outside the poses and are left out.",)
     assert recording(rows, start=10, frame_times=(1, 2)).frames is None
 
 
 def test_nothing_is_noted_when_nothing_is_dropped():
     whole = recording(np.array([[1, 2, 0, 1], [1, 2, 100, 1]]), frame_times=(0, 100))
-    assert len(whole.index.events()) == 2 and whole.notes == []
+    assert len(index_events(whole).events()) == 2 and whole.notes == index_events(whole).notes == ()
 
 
 def test_read_recording_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

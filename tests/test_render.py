@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray import ray_triangle
 
 import enerf_ns.dataparsers
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.eds import PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA
-from enerf_ns.simulator import textures
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.formats.eds import PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA
+from enerf_ns.simulator.scene import textures
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene
 from enerf_ns.simulator.trajectories import MOTIONS, look_at
 
 WIDTH, HEIGHT = 48, 36
@@ -724,9 +724,9 @@ def test_pictures_from_several_threads_are_those_from_one():
 
 PICTURE = """
 import hashlib, numpy as np
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 renderer = Renderer(SCENES["carpet"](np.random.default_rng(0)), Camera(64, 48, 55.0, 55.0, 31.5, 23.5))
 pose = np.array([[1.0, 0, 0, 0], [0, -0.6, 0.8, -0.75], [0, -0.8, -0.6, 1.3]])
 print(hashlib.sha256(renderer.brightness(pose).tobytes() + renderer.depth(pose).tobytes()).hexdigest())

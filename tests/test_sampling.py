@@ -14,11 +14,11 @@ import torch
 from known_points import points_seen, project, reference_poses
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.render import Renderer
 from enerf_ns.simulator.sampling import MAX_CHANGE, MOST_HALVINGS, Render, adaptive_renders, render_times
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.trajectories import MOTIONS
 
 EPS = 0.001

@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError
-from enerf_ns.simulator import textures
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scene_files import load_scene
-from enerf_ns.simulator.scenes import SCENES, Scene, Surface, build_scene, corner_normals
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.simulator.scene import textures
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scene_files import load_scene
+from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene, corner_normals
 
 RNG = np.random.default_rng
 COLOURS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [200, 120, 40]]], np.uint8)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns import presets as training
-from enerf_ns.simulator.presets import PRESETS, SimulationPreset
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns import paper_selections as training
+from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
+from enerf_ns.simulator.scene.scenes import SCENES
 
 PIXELS = 64
 """Of the tests' pictures is every so many of the rows and columns."""

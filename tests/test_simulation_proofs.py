@@ -16,15 +16,16 @@ import torch
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import Events, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.frames import Exposures, Frame
-from enerf_ns.simulator.render import Renderer
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, adaptive_renders, render_times
-from enerf_ns.simulator.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene
 from enerf_ns.simulator.sources import RenderedScene, Source
 from enerf_ns.simulator.trajectories import MOTIONS
 

@@ -15,12 +15,14 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.scripts.simulate import PUBLISHED_RIGS, Simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.trajectories import MOTIONS, look_at, sampled
 
 WIDTH, HEIGHT = 48, 36
@@ -141,7 +143,7 @@ def test_the_recording_is_read_back(recording):
     times = torch.linspace(0, 3e8, 50).long()
     written = torch.from_numpy(written_poses(recording, times.numpy()))
     torch.testing.assert_close(read.trajectory.poses(times), written, atol=1e-9, rtol=0)
-    assert len(read.index.events()) == json.loads((recording / "simulation.json").read_text())["num_events"]
+    assert len(index_events(read).events()) == json.loads((recording / "simulation.json").read_text())["num_events"]
 
 
 def test_the_same_seed_writes_the_same_files_and_another_seed_others(tmp_path):
@@ -226,7 +228,7 @@ def test_every_layout_is_written_and_read_back(tmp_path):
     read = read_recording(tmp_path / "own")
     assert read.refractory_period == 100_000 and read.contrast_thresholds == (0.25, 0.25)
     assert read.frames is not None and read.blurred_frames is not None and len(read.frames.times) == 6
-    assert len(read.index) > 1000 and read.camera.model == read.frames.camera.model == "radtan"
+    assert len(index_events(read)) > 1000 and read.camera.model == read.frames.camera.model == "radtan"
     thresholds = np.load(tmp_path / "own/thresholds.npy")
     assert thresholds.shape == (2, 48, 64) and 0.02 < thresholds.std() / thresholds.mean() < 0.04
     scene = SCENES["roads"](np.random.default_rng(0).spawn(2)[0])
@@ -324,7 +326,7 @@ def test_frames_in_colour_leave_the_events_as_they_are(tmp_path):
     counts = []
     for color in (False, True):
         Simulate(tmp_path / str(color), "roads", color=color, **SHORT).main()
-        counts.append(len(read_recording(tmp_path / str(color)).index))
+        counts.append(len(index_events(read_recording(tmp_path / str(color)))))
     assert counts[0] == pytest.approx(counts[1], rel=0.01)
 
 

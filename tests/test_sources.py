@@ -19,11 +19,12 @@ import torch
 from recordings import write_esim
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, TrainedRun, Video, linear_from_srgb
 from enerf_ns.simulator.trajectories import look_at, spiral
 

@@ -13,7 +13,7 @@ from recordings import POSE_TIMES, poses, write_esim
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.trajectories import from_file, key_frames, look_at, shake, spiral
 

@@ -20,9 +20,12 @@ import torch
 from known_points import points_seen, project, reference_poses
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers import tum_vie
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, load_image, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats import tum_vie
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 SIDES = ("left", "right")
 EXPOSURES = (4_000, 30_000, 12_000)
@@ -352,7 +355,7 @@ def test_both_layouts_give_the_same_rays(real_recordings, side: str):
         (prepared_frames.trajectory, raw_frames.trajectory),
     ):
         assert torch.equal(one.poses(times), other.poses(times))
-    assert raw.notes == []
+    assert list(raw.notes) == []
     assert len(prepared.notes) == 1
     assert "calib_undist.json states the frames' intrinsics for balance 0.5" in prepared.notes[0]
 
@@ -381,7 +384,7 @@ def test_the_zero_of_time_is_the_earliest_first_stamp(raw: Path):
     assert after.trajectory.start == 100_000_000
     assert (read_events(after)[:, 2] == read_events(before)[:, 2] + 100_000_000).all()
     assert len(frames_of(after).times) == 2
-    assert after.notes == ["1 of 3 frames (33 %) lie outside the poses and are left out."]
+    assert list(after.notes) == ["1 of 3 frames (33 %) lie outside the poses and are left out."]
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -407,12 +410,12 @@ def test_of_two_calibrations_the_one_of_the_sequence_is_taken(raw: Path, sequenc
     for path in list(raw.glob("mocap-desk2-*")):
         path.rename(raw / path.name.replace("mocap-desk2", sequence))
     recording = read(raw)
-    assert recording.camera.fx == fx and recording.notes == []
+    assert recording.camera.fx == fx and list(recording.notes) == []
 
 
 def test_a_sequence_of_another_name_takes_the_only_calibration_and_says_so(raw: Path):
     (raw / "mocap-desk2-events_left.h5").rename(raw / "kitchen-events_left.h5")
-    assert read(raw).notes == ["kitchen is none of the published sequences; calibration A is used."]
+    assert list(read(raw).notes) == ["kitchen is none of the published sequences; calibration A is used."]
 
 
 def test_frames_and_poses_may_lie_beside_the_events(raw: Path):
@@ -438,7 +441,7 @@ def test_without_exposures_frames_have_their_stamps(raw: Path):
     recording = read(raw)
     stamps = np.loadtxt(images / "image_timestamps_left.txt").astype(np.int64)
     np.testing.assert_array_equal(frames_of(recording).times, (stamps - 5_000_000) * 1000)
-    assert recording.notes == ["image_exposures_left.txt is missing, so frames have the poses at their stamps."]
+    assert list(recording.notes) == ["image_exposures_left.txt is missing, so frames have the poses at their stamps."]
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -472,7 +475,7 @@ def test_other_intrinsics_of_prepared_frames_stand(prepared: Path):
     (prepared / "calib_undist.json").write_text(json.dumps(content))
     recording = read(prepared)
     assert frames_of(recording).camera == Camera(1024, 1024, 655.0, 656.0, 501.0, 511.0)
-    assert recording.notes == []
+    assert list(recording.notes) == []
 
 
 def test_the_intrinsics_of_prepared_frames_stand_where_the_lens_is_not_known(prepared: Path):
@@ -482,7 +485,7 @@ def test_the_intrinsics_of_prepared_frames_stand_where_the_lens_is_not_known(pre
     (prepared / "calib_undist.json").write_text(json.dumps({"value0": known}))
     recording = read(prepared)
     assert frames_of(recording).camera == Camera(1024, 1024, **content["intrinsics_undistorted"][0])
-    assert recording.notes == []
+    assert list(recording.notes) == []
 
 
 def edit_json(name: str, change: Callable[[dict], object]) -> Callable[[Path], None]:

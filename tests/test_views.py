@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from numpy.typing import ArrayLike
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator import textures
-from enerf_ns.simulator.render import Renderer
-from enerf_ns.simulator.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.simulator.scene import textures
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.simulator.scene.view_check import check_view, winding_number
 from enerf_ns.simulator.sources import RenderedScene
 from enerf_ns.simulator.trajectories import MOTIONS, look_at
-from enerf_ns.simulator.views import check_view, winding_number
 
 END = 200_000_000
 """ns"""

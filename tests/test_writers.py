@@ -23,9 +23,13 @@ from known_points import reference_poses
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.inspection import find_problems
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, RecordingError, load_image, read_recording
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import find_problems
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator import writers
 from enerf_ns.simulator.frames import Frame, FrameSettings, develop
@@ -173,7 +177,7 @@ def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 def test_the_layout_is_recognised_and_its_reader_notes_nothing_lost(written: Written):
     assert written.recording.format == written.layout
     assert not [note for note in written.recording.notes if "left out" in note or "renormalised" in note]
-    assert len(written.recording.index) == len(written.events)
+    assert len(index_events(written.recording)) == len(written.events)
 
 
 def test_events_are_read_back_in_their_order(written: Written):
@@ -318,7 +322,7 @@ def test_high_dynamic_range(tmp_path: Path, channels: tuple[int, ...], monkeypat
         cv2.haveImageWriter(".exr")
     except cv2.error:
         pytest.skip("this OpenCV writes no .exr")
-    assert write("esim", tmp_path / "exr", setup, random_events(CENTRED), channels).notes == []
+    assert list(write("esim", tmp_path / "exr", setup, random_events(CENTRED), channels).notes) == []
     found = cv2.imread(str(tmp_path / "exr/hdr/00007.exr"), cv2.IMREAD_UNCHANGED)
     assert found is not None
     np.testing.assert_array_equal(found[..., ::-1] if channels else found, frame.sharp.astype(np.float32))
@@ -345,7 +349,7 @@ def test_without_poses_and_depth(tmp_path: Path):
     with pytest.raises(RecordingError, match=r"poses\.txt is missing"):
         read_recording(folder, "event_recording")
     (folder / "poses.txt").write_text(f"0 0 0 0 0 0 0 1\n{END} 1 0 0 0 0 0 1\n")
-    assert len(read_recording(folder).index) == 5000
+    assert len(index_events(read_recording(folder))) == 5000
 
 
 # ------------------------------------------------------------------------------------- what others expect of layouts

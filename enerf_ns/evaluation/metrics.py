@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from enerf_ns.event_camera import inverse_linlog, linlog
+from enerf_ns.sensor.response import inverse_linlog, linlog
 
 
 def align_brightness(

@@ -8,7 +8,7 @@ from typing import Annotated, Union  # tyro reads these annotations on Python 3.
 
 import tyro
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.demo import Demo
 from enerf_ns.scripts.inspect import Inspect
@@ -29,7 +29,7 @@ def entrypoint() -> None:
     warnings.filterwarnings("ignore", module="nerfstudio")
     try:
         tyro.cli(Command, description="Radiance fields from event cameras.").main()
-    except RecordingError as error:
+    except UserError as error:
         raise SystemExit(f"enerf: {error}") from error
     except MemoryError as error:
         raise SystemExit("enerf: There is not enough memory for this; ask for less at a time.") from error

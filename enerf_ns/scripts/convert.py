@@ -11,10 +11,11 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from enerf_ns.dataparsers import event_recording
-from enerf_ns.dataparsers.event_files import EventFile, open_event_file
-from enerf_ns.dataparsers.recording import RecordingError, read_recording
-from enerf_ns.dataparsers.text_tables import read_poses
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.text_tables import read_poses
 
 CONSOLE = Console(width=120)
 

@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.scripts.simulate import Simulate
 
 
@@ -51,7 +52,7 @@ class Demo:
         run_config = config.get_base_dir() / "config.yml"
         _, pipeline, _, _ = eval_setup(run_config)
         assert isinstance(pipeline, EnerfPipeline)
-        events = len(pipeline.datamanager.train_dataset.recording.index)
+        events = len(index_events(pipeline.datamanager.train_dataset.recording))
         extra = {"train_seconds": round(train_seconds, 1), "events": events}
         scores = write_scores_and_picture(pipeline, output_dir, extra)
         render_video(pipeline, run_config, output_dir)

@@ -23,9 +23,13 @@ from rich.markup import escape
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.events import event_picture
-from enerf_ns.dataparsers.inspection import (
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.event_index import event_picture
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import (
     EventStatistics,
     Problem,
     event_statistics,
@@ -33,7 +37,7 @@ from enerf_ns.dataparsers.inspection import (
     pose_gaps,
     unusual_rates,
 )
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, load_image, read_recording
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -105,7 +109,7 @@ class Inspection:
         near_far, unknown = None, []
         try:
             near_far = depth_range(recording, EventDataParserConfig())
-        except RecordingError as error:
+        except UserError as error:
             unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
         return cls(recording, statistics, near_far, find_problems(recording, near_far) + unknown)
 
@@ -116,9 +120,13 @@ class Inspection:
             for name, value in rows.items():
                 table.add_row(name, escape(value))
             CONSOLE.print(table)
-        for note in self.recording.notes:
+        for note in self.notes():
             CONSOLE.print(f"[yellow]note: {escape(note)}[/yellow]", highlight=False)
         CONSOLE.print(problems_table(self.problems))
+
+    def notes(self) -> list[str]:
+        """What was dropped, mended or assumed, one sentence each."""
+        return [*self.recording.notes, *index_events(self.recording).notes]
 
     def found(self) -> dict[str, str]:
         """What the reader found, by name."""
@@ -158,7 +166,7 @@ class Inspection:
         gaps = pose_gaps(recording, statistics)
         missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
         path = self._path(1000)[1][:, :, 3]
-        hot = recording.index.hot_pixels.numpy()
+        hot = index_events(recording).hot_pixels.numpy()
         width = recording.camera.width
         places = ", ".join(f"({pixel % width}, {pixel // width})" for pixel in hot[:NAMED_HOT_PIXELS])
         more = f" and {len(hot) - NAMED_HOT_PIXELS} more" if len(hot) > NAMED_HOT_PIXELS else ""
@@ -196,7 +204,7 @@ class Inspection:
             name=html.escape(self.recording.path.name),
             path=html.escape(str(self.recording.path)),
             problems=_problem_box(self.problems),
-            found=_html_table(self.found(), self.recording.notes),
+            found=_html_table(self.found(), self.notes()),
             numbers=_html_table(self.numbers()),
             timeline=_plot(self.timeline(), "events, frames and poses, and the event rate over time"),
             instants_title="Events" if frames is None else "Frames, and events at the same time, undistorted",
@@ -291,7 +299,7 @@ class Inspection:
         axis = figure.subplots()
         colours = colormaps["inferno"].with_extremes(bad="#c9ced8")
         shown = axis.imshow(np.ma.masked_equal(counts, 0), cmap=colours, norm=LogNorm(1, max(int(counts.max()), 2)))
-        hot = self.recording.index.hot_pixels.numpy()
+        hot = index_events(self.recording).hot_pixels.numpy()
         if len(hot):
             axis.scatter(hot % width, hot // width, s=40, facecolors="none", edgecolors="#22c7e8", linewidths=1.2)
         axis.set_xlabel("grey: no events" + "; circled: hot, left out" * bool(len(hot)))
@@ -321,7 +329,7 @@ class Inspection:
         caption = f"{time * 1e-9:.3f} s"
         if frame is not None and camera is not None:
             pictures.append(_image(camera.undistort(load_image(frame)), "JPEG", f"frame at {caption}"))
-        events = event_picture(self.recording.index, self.recording.camera, time)
+        events = event_picture(index_events(self.recording), self.recording.camera, time)
         pictures.append(_image(events, "PNG", f"events at {caption}"))
         name = f", {html.escape(frame.name)}" if frame else ""
         return f'<figure><div class="pair">{"".join(pictures)}</div><figcaption>{caption}{name}</figcaption></figure>'

@@ -14,6 +14,7 @@ import torch
 import tyro
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
     """
     from matplotlib.figure import Figure
 
-    from enerf_ns.dataparsers.events import event_picture
+    from enerf_ns.dataparsers.event_index import event_picture
 
     recording = pipeline.datamanager.eval_dataset.recording
     titles = ["held-out frame", "render", "depth", *["events"] * (recording.held_out_frames is None)]
@@ -109,7 +110,7 @@ def save_picture(views: list[HeldOutView], pipeline: EnerfPipeline, path: Path) 
         row[1].imshow(view.rendered.clamp(0, 1).numpy())
         depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo", vmin=near, vmax=far)
         if recording.held_out_frames is None:
-            row[3].imshow(event_picture(recording.index, recording.camera, view.time))
+            row[3].imshow(event_picture(index_events(recording), recording.camera, view.time))
             row[0].set_ylabel(f"{view.time * 1e-9:.2f} s")
         for axis in row:
             axis.set_xticks([])

@@ -18,23 +18,24 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers import eds, tum_vie
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.event_recording import read_cameras
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats import eds, tum_vie
+from enerf_ns.dataparsers.formats.event_recording import read_cameras
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.event_camera import color_channels, luma, pixel_brightness
+from enerf_ns.sensor.response import color_channels, luma, pixel_brightness
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
-from enerf_ns.simulator.presets import PRESETS, SimulationPreset
+from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
 from enerf_ns.simulator.preview import Preview
-from enerf_ns.simulator.render import Renderer
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, Render, adaptive_renders, render_times
-from enerf_ns.simulator.scene_files import load_scene
-from enerf_ns.simulator.scenes import SCENES
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scene_files import load_scene
+from enerf_ns.simulator.scene.scenes import SCENES
+from enerf_ns.simulator.scene.view_check import check_view
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
-from enerf_ns.simulator.views import check_view
 from enerf_ns.simulator.writers import FEWEST_ESIM_FRAMES, Setup, Writer, is_second_camera, open_writer
 
 CONSOLE = Console(width=120)

@@ -33,7 +33,8 @@ import tyro
 from jaxtyping import Float, Int64
 
 from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import Events
 
 READOUT_QUEUE = 1000
 """Events that may wait for the bus; one that comes while so many wait is lost."""

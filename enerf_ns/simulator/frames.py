@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
 
 MOST_LEVEL = 1e6
 """Of what is white; pixels brighter than this have the noise of this."""

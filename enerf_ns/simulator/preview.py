@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.simulator.frames import in_colour
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)

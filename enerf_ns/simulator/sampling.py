@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64
 
-from enerf_ns.dataparsers.calibration import Camera
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.event_sensor import PartialPicture
-from enerf_ns.simulator.render import pixel_steps
+from enerf_ns.simulator.scene.render import pixel_steps
 
 MOTION_STEP = 1_000_000
 """Nanoseconds from one pose to the next of those between which displacements are measured."""

@@ -15,13 +15,15 @@ import torch
 from jaxtyping import Float, Float32, Int64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import EventRecording, RecordingError, image_size, load_image
-from enerf_ns.dataparsers.text_tables import read_times
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import image_size, load_image
+from enerf_ns.dataparsers.formats.text_tables import read_times
+from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from enerf_ns.simulator.render import Renderer
+    from enerf_ns.simulator.scene.render import Renderer
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 

@@ -39,10 +39,11 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers import eds, tum_vie
-from enerf_ns.dataparsers.calibration import Camera, check_rotation
-from enerf_ns.dataparsers.event_recording import MOUNTING_KEY, STORED_TYPES, camera_json, write_poses
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.camera import Camera, check_rotation
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats import eds, tum_vie
+from enerf_ns.dataparsers.formats.event_recording import MOUNTING_KEY, STORED_TYPES, camera_json, write_poses
+from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.frames import Frame, FrameSettings, develop, in_colour
 

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
 from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.simulator.scenes import Scene
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.simulator.scene.scenes import Scene
 
 GROUP = 4
 """Samples that take brightness from one place, in their middle, if they all see the same triangle."""

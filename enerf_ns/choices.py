@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, depth_range, scene_normalisation
-from enerf_ns.dataparsers.recording import EventRecording, RecordingError, load_image
-from enerf_ns.event_camera import thresholds_from_polarity
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.sensor.response import thresholds_from_polarity
 
 if TYPE_CHECKING:
     from enerf_ns.enerf_pipeline import EnerfPipelineConfig
@@ -85,8 +88,8 @@ def fill_in_choices(config: EnerfPipelineConfig, recording: EventRecording) -> l
     elif recording.contrast_thresholds is not None:
         model.contrast_thresholds, why = recording.contrast_thresholds, "the recording states them"
     else:
-        num_on = recording.index.num_positive
-        num_off = len(recording.index) - num_on
+        num_on = index_events(recording).num_positive
+        num_off = len(index_events(recording)) - num_on
         model.contrast_thresholds = thresholds_from_polarity(num_on, num_off)
         why = f"{num_on:,} on and {num_off:,} off events; their mean is assumed"
     add("contrast thresholds", use_events, "on {:.3f}, off {:.3f}".format(*model.contrast_thresholds), why)

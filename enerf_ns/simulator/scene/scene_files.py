@@ -58,10 +58,11 @@ from scipy.spatial.transform import Rotation
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 
-from enerf_ns.dataparsers.event_recording import read_json
-from enerf_ns.dataparsers.recording import RecordingError, load_image
-from enerf_ns.simulator import textures
-from enerf_ns.simulator.scenes import (
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.formats.event_recording import read_json
+from enerf_ns.simulator.scene import textures
+from enerf_ns.simulator.scene.scenes import (
     LIGHT,
     Scene,
     Surface,
@@ -167,7 +168,7 @@ def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
             graph: Any = trimesh.load(str(path), resolver=files, process=False, force="scene")
             if not files.fault:
                 pieces = _pieces(path, graph, is_gltf, expected, notes)
-    except RecordingError:
+    except UserError:
         raise
     except ImportError as error:
         raise RecordingError(f"{path} needs a package that is not installed: {_in_one_line(error)}.") from error

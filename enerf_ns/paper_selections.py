@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal
 
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 if TYPE_CHECKING:
     from enerf_ns.enerf_trainer import EnerfTrainerConfig  # which imports this module

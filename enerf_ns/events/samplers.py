@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Int32, Int64
 from torch import Tensor
 
-from enerf_ns.dataparsers.events import EventIndex
+from enerf_ns.dataparsers.event_index import EventIndex
 
 CHUNK = 2**20
 """Events looked at together while the pairs are counted, so that this needs little memory beside the index."""

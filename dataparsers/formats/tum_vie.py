@@ -46,16 +46,18 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.hdf5_events import Hdf5Events, read_rectify_map
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, image_size
-from enerf_ns.dataparsers.text_tables import (
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import image_size
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.formats.text_tables import (
     QUATERNION_TOLERANCE,
     parse_numbers,
     read_poses,
     read_rows,
     read_times,
 )
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/mocap_data.txt", "calib_undist.json")
@@ -177,7 +179,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         stream_events=lambda: events.stream(zero),
         event_files=(events_file,),
         frames=frames,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{events_file}, event {index + 1}",
         num_events=events.num_events,
     )

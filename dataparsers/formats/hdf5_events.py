@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32
 
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events
 
 if TYPE_CHECKING:
     import h5py
@@ -221,7 +222,7 @@ def _reading(path: Path, what: str) -> Iterator[None]:
     """Turns errors of the HDF5 library into one sentence about the file."""
     try:
         yield
-    except RecordingError:
+    except UserError:
         raise
     except FileNotFoundError as error:
         raise RecordingError(f"{path} is missing; an HDF5 file with {what} was expected there.") from error

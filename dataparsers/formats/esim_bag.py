@@ -24,8 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.esim_npz import (
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats.esim_npz import (
     checked_camera,
     checked_sensor,
     checked_trajectory,
@@ -33,7 +34,7 @@ from enerf_ns.dataparsers.esim_npz import (
     read_views,
     reading,
 )
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, RecordingError
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("esim.bag", "esim.conf")
@@ -96,7 +97,7 @@ def read(folder: Path) -> EventRecording:
         contrast_thresholds=contrast_thresholds,
         refractory_period=refractory_period,
         bayer_pattern=bayer_pattern,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{path}, event {index + 1}",
     )
 

@@ -17,16 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import (
-    EventRecording,
-    Events,
-    Frames,
-    RecordingError,
-    check_image_size,
-    image_size,
-)
-from enerf_ns.dataparsers.text_tables import parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import check_image_size, image_size
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events.txt", "groundtruth.txt", "calib.txt")
@@ -70,7 +65,7 @@ def read(folder: Path) -> EventRecording:
         stream_events=lambda: _stream_events(events_file, num_bytes, zero),
         event_files=(events_file,),
         frames=Frames(frame_files, frame_times - zero, camera, trajectory) if frame_files else None,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{events_file}, line {index + 1}",
     )
 

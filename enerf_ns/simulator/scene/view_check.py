@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.render import Renderer
+from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.sources import RenderedScene
 
 PATH_STEP, MOST_PATH_STEPS = 2_000_000, 10_000

@@ -19,17 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from enerf_ns.dataparsers.calibration import Camera
-from enerf_ns.dataparsers.recording import (
-    EVENTS_AT_A_TIME,
-    EventRecording,
-    Events,
-    Frames,
-    RecordingError,
-    check_image_size,
-    load_array,
-)
-from enerf_ns.dataparsers.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import check_image_size, load_array
+from enerf_ns.dataparsers.formats.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
@@ -77,7 +71,7 @@ def read(folder: Path) -> EventRecording:
         blurred_frames=blurred_frames,
         contrast_thresholds=contrast_thresholds,
         depth_range=depth_range,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: _locate(event_files, num_rows, index),
         num_events=sum(num_rows),
     )

@@ -21,7 +21,8 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from enerf_ns.dataparsers.recording import Events, RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording import Events
 
 BYTES_AT_A_TIME = 2**18
 """Read at once; a vector word of two bytes may hold twelve events."""

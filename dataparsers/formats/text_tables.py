@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from enerf_ns.dataparsers.recording import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError
 
 NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 

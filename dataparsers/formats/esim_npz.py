@@ -34,9 +34,11 @@ import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.calibration import Camera, check_rotation
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames, RecordingError, image_size
-from enerf_ns.dataparsers.text_tables import FARTHEST, QUATERNION_TOLERANCE, parse_array
+from enerf_ns.dataparsers.camera import Camera, check_rotation
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.files import image_size
+from enerf_ns.dataparsers.formats.text_tables import FARTHEST, QUATERNION_TOLERANCE, parse_array
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
@@ -87,7 +89,7 @@ def read(folder: Path) -> EventRecording:
         contrast_thresholds=contrast_thresholds,
         refractory_period=refractory_period,
         bayer_pattern=bayer_pattern,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{events_file}, event {index + 1}",
         num_events=num_events,
     )
@@ -106,7 +108,7 @@ def reading(path: Path, expected: str) -> Iterator[None]:
     """
     try:
         yield
-    except RecordingError:
+    except UserError:
         raise
     except FileNotFoundError as error:
         raise RecordingError(f"{path} is missing; {expected} was expected there.") from error

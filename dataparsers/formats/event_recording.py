@@ -29,17 +29,11 @@ from jaxtyping import Float64
 from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers.calibration import Camera, check_rotation
-from enerf_ns.dataparsers.recording import (
-    EVENTS_AT_A_TIME,
-    EventRecording,
-    Events,
-    Frames,
-    RecordingError,
-    check_image_size,
-    load_array,
-)
-from enerf_ns.dataparsers.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.camera import Camera, check_rotation
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import check_image_size, load_array
+from enerf_ns.dataparsers.formats.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
@@ -96,7 +90,7 @@ def read(folder: Path) -> EventRecording:
         depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
         refractory_period=_parse_refractory_period(path, about),
         bayer_pattern=_parse_bayer_pattern(path, about),
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{folder / 'events'}, event {index + 1},",
         num_events=num_events,
     )

@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int64
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 MAX_BINS = 1000
@@ -150,7 +151,7 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
     Raises:
         RecordingError: The events cannot be used.
     """
-    index, camera = recording.index, recording.camera
+    index, camera = index_events(recording), recording.camera
     step = 1 if at_most is None else -(-len(index) // at_most)
     num_bins = int(np.clip(len(index) // step // EVENTS_PER_BIN, 1, MAX_BINS))
     start, end = index.span
@@ -186,7 +187,7 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
     flag = _time_range_without(np.concatenate([gaps, jumps, silences, bursts]), statistics)
     return [
         *_unfinished(recording.path),
-        *_left_out(recording),
+        *_left_out({**recording.shares_outside_poses, "events": index_events(recording).share_outside_poses}),
         *_pose_problems(recording, statistics, gaps, jumps, flag),
         *_distance_problems(recording, statistics, depth_range),
         *_rate_problems(silences, bursts, flag),
@@ -255,8 +256,8 @@ def _unfinished(folder: Path) -> Iterator[Problem]:
         )
 
 
-def _left_out(recording: EventRecording) -> Iterator[Problem]:
-    for what, share in recording.shares_outside_poses.items():
+def _left_out(shares_outside_poses: dict[str, float]) -> Iterator[Problem]:
+    for what, share in shares_outside_poses.items():
         if share > MAX_SHARE_OUTSIDE:
             yield Problem(
                 f"{100 * share:.2g} % of the {what} lie outside the poses and are left out.",

@@ -13,6 +13,15 @@ from jaxtyping import Float32, Float64, Shaped
 ROUND_TRIP_TOLERANCE = 1e-6
 """Pixels between a pixel and the projection of its direction."""
 
+SHORTEST_FOCAL_LENGTH, LONGEST_FOCAL_LENGTH = 0.01, 1e4
+"""As a multiple of the width, or of the height: a view of 179 degrees, and one of 0.006."""
+
+FARTHEST_PRINCIPAL_POINT = 10
+"""From the middle of the image, as a multiple of its width or height."""
+
+STEEPEST_DIRECTION = 1e4
+"""Largest x / z and y / z of where a pixel looks."""
+
 ROTATION_TOLERANCE = 1e-3
 """Largest entry by which the product of a rotation and its transpose may differ from one."""
 
@@ -22,7 +31,11 @@ INVERSION_STEPS = 60
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres."""
+    """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres.
+
+    Raises:
+        ValueError: It fits no lens; a sentence that can follow "FILE holds".
+    """
 
     width: int
     """Pixels."""
@@ -39,6 +52,24 @@ class Camera:
     model: Literal["pinhole", "radtan", "fisheye", "lookup"] = "pinhole"
     directions: Float64[np.ndarray, "height width 2"] | None = field(default=None, compare=False)
     """For lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted camera."""
+
+    def __post_init__(self) -> None:
+        axes = ((self.width, self.fx, self.cx), (self.height, self.fy, self.cy))
+        fits = all(
+            SHORTEST_FOCAL_LENGTH * side < focal_length < LONGEST_FOCAL_LENGTH * side
+            and abs(principal_point - side / 2) < FARTHEST_PRINCIPAL_POINT * side
+            for side, focal_length, principal_point in axes
+        )
+        if not fits:
+            raise ValueError(
+                f"a camera of {self.width} x {self.height} pixels with the focal lengths {self.fx:g} and {self.fy:g} "
+                f"and the principal point ({self.cx:g}, {self.cy:g}), which fits no lens; state all in pixels."
+            )
+        if self.directions is not None and not np.abs(self.directions).max() < STEEPEST_DIRECTION:
+            raise ValueError(
+                f"a table of where each pixel of a camera looks, in which x / z and y / z reach "
+                f"{np.abs(self.directions).max():g}, which fits no lens; make it again."
+            )
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 3"]:

@@ -32,10 +32,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from enerf_ns.dataparsers.calibration import Camera, check_rotation
-from enerf_ns.dataparsers.hdf5_events import Hdf5Events, read_rectify_map
-from enerf_ns.dataparsers.recording import EventRecording, Frames, RecordingError, check_image_size
-from enerf_ns.dataparsers.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.camera import Camera, check_rotation
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import check_image_size
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
@@ -140,7 +142,7 @@ def read(folder: Path) -> EventRecording:
         stream_events=lambda: events.stream(zero),
         event_files=(events.path,),
         frames=frames,
-        notes=notes,
+        notes=tuple(notes),
         locate_event=lambda index: f"{events.path}, event {index + 1}",
         num_events=events.num_events,
     )
