@@ -322,7 +322,7 @@ def test_a_camera_that_moves_against_the_other_is_refused(tmp_path: Path):
 
 
 def test_the_lines_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    readme = (Path(__file__).parents[3] / "README.md").read_text()
     blocks = [block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "recording.json" in block]
     if not blocks:
         pytest.skip("README.md has no lines that write a recording")

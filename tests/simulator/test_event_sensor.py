@@ -754,7 +754,7 @@ def test_pictures_that_do_not_follow_are_refused():
 
 def test_the_lines_in_the_readme():
     """A pixel fires once a threshold of every rise and fall, but for the last one begun before each turn."""
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
     (lines,) = [lines for lines in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "adaptive_renders" in lines]
     printed: list[tuple[Any, ...]] = []
     exec(lines, {"print": lambda *columns: printed.append(columns)})
