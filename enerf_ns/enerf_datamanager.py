@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
 from enerf_ns.ray_samplers import PairedRayBundle
-from enerf_ns.sensor.response import color_channels
+from enerf_ns.sensor.response import colour_channels
 
 EventDataParserUnion = OmitSubcommandPrefixes[
     subcommand_type_from_defaults(
@@ -111,7 +111,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         self.pixel_area = 1.0 / (camera.fx * camera.fy)
         self.pixel_channels = None
         if recording.bayer_pattern is not None:
-            channels = color_channels(recording.bayer_pattern, camera.width, camera.height)
+            channels = colour_channels(recording.bayer_pattern, camera.width, camera.height)
             self.pixel_channels = channels.to(self.device)
         self.trajectory = recording.trajectory
 

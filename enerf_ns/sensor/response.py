@@ -1,28 +1,107 @@
-"""The sensor model: how an event camera sees brightness.
+"""How a pixel answers brightness: what it sees of colours, and the logarithm that it compares.
 
-Brightness is linear radiance in [0, 1]; the sensor compares its logarithm, `linlog(255 * brightness)`, at two instants
-and fires one event per contrast threshold crossed (Klenk et al., E-NeRF, RA-L 2023, equations 1 to 3).
+Brightness is linear radiance, usually in [0, 1]. The field and the simulator use the same functions; each works on
+tensors of any shape and type of float, and is differentiable.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 LINEAR_UNTIL = 20.0
-"""B of the paper: the map is linear below this brightness (of 255) and logarithmic above."""
+"""B of the paper: linlog is linear below this brightness (of 255) and logarithmic above."""
 
-DEFAULT_CONTRAST_THRESHOLD = 0.25
-"""Mean threshold assumed where a recording does not state one. Events fix brightness only up to this factor."""
+SMALLEST_OFFSET, LARGEST_OFFSET = 1e-9, 1.0
+"""Of `Logarithm`."""
+
+
+class Response(Protocol):
+    """What a pixel makes of brightness; increasing."""
+
+    @property
+    def name(self) -> str:
+        """As `response_named` reads it."""
+        ...
+
+    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Log brightness, in the units in which contrast thresholds are."""
+        ...
+
+    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Linear brightness whose log brightness is the argument."""
+        ...
+
+
+@dataclass(frozen=True)
+class Linlog:
+    """The response of E-NeRF (Klenk et al., RA-L 2023, after v2e): `linlog`."""
+
+    @property
+    def name(self) -> str:
+        """As `response_named` reads it."""
+        return "linlog"
+
+    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """As of `linlog`."""
+        return linlog(brightness)
+
+    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """As of `inverse_linlog`."""
+        return inverse_linlog(log_brightness)
+
+
+@dataclass(frozen=True)
+class Logarithm:
+    """ln(brightness + offset), as simulators have it (ESIM: Rebecq, Gehrig, Scaramuzza, CoRL 2018)."""
+
+    offset: float = 0.001
+
+    @property
+    def name(self) -> str:
+        """As `response_named` reads it."""
+        return f"logarithm:{self.offset!r}"
+
+    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Log brightness; of brightness above -offset."""
+        return torch.log(brightness + self.offset)
+
+    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Linear brightness whose log brightness is the argument."""
+        return torch.exp(log_brightness) - self.offset
+
+
+def response_named(name: str) -> Response:
+    """The response that a flag or a recording names: `linlog`, or `logarithm:OFFSET` such as `logarithm:0.001`.
+
+    Raises:
+        ValueError: It is neither; a sentence that can follow the name of a file or flag.
+    """
+    kind, _, argument = name.partition(":")
+    if name == "linlog":
+        return Linlog()
+    try:
+        offset = float(argument)
+    except ValueError:
+        offset = math.nan
+    if kind != "logarithm" or not SMALLEST_OFFSET <= offset <= LARGEST_OFFSET:
+        raise ValueError(
+            f"the response {name!r}, but linlog, or logarithm:OFFSET with an offset from {SMALLEST_OFFSET:g} to "
+            f"{LARGEST_OFFSET:g}, such as logarithm:0.001, was expected."
+        )
+    return Logarithm(offset)
 
 
 def linlog(brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Log brightness of the sensor: I ln(B)/B below B, ln(I) above, with I = 255 * brightness and B = 20.
+    """Log brightness of E-NeRF: I ln(B)/B below B, ln(I) above, with I = 255 * brightness and B = 20.
 
-    Continuous and increasing, with slope ln(B)/B per grey level at zero; its slope jumps to 1/B at B.
+    Continuous and increasing, with slope ln(B)/B per grey level at zero; its slope jumps to 1/B at B (equation 2 of the
+    paper).
 
     Args:
         brightness: Linear brightness, usually in [0, 1]; negative values extend the linear part.
@@ -50,7 +129,7 @@ def luma(rgb: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch"]:
     return rgb @ rgb.new_tensor(LUMA)
 
 
-def color_channels(pattern: str, width: int, height: int) -> Int64[Tensor, " pixels"]:
+def colour_channels(pattern: str, width: int, height: int) -> Int64[Tensor, " pixels"]:
     """Colour channel, 0, 1 or 2, that each pixel of a sensor with a colour filter sees, by pixel number.
 
     Args:
@@ -72,29 +151,3 @@ def pixel_brightness(
 ) -> Float[Tensor, "*batch"]:
     """Brightness that pixels see of three colour channels: each its own channel, or luma where that is None."""
     return luma(rgb) if channel is None else rgb.gather(-1, channel[..., None])[..., 0]
-
-
-def measured_change(
-    on: Int[Tensor, "*batch"], off: Int[Tensor, "*batch"], thresholds: tuple[float, float]
-) -> Float[Tensor, "*batch"]:
-    """Change of log brightness that a pixel reported: C_on * (on events) - C_off * (off events).
-
-    Args:
-        on: Number of positive events after the first instant, up to and with the second.
-        off: Number of negative events in the same interval.
-        thresholds: Contrast thresholds (C_on, C_off), both positive, in units of log brightness.
-    """
-    return thresholds[0] * on - thresholds[1] * off
-
-
-def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
-    """Contrast thresholds (C_on, C_off) under which a whole recording brightens as much as it darkens.
-
-    Over a long recording every pixel's changes nearly cancel, so num_on * C_on = num_off * C_off; the mean of the two,
-    which events cannot tell, is `DEFAULT_CONTRAST_THRESHOLD`. A recording without one of the polarities gives equal
-    thresholds.
-    """
-    if num_on == 0 or num_off == 0:
-        return DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD
-    on = 2.0 * DEFAULT_CONTRAST_THRESHOLD * num_off / (num_on + num_off)
-    return on, 2.0 * DEFAULT_CONTRAST_THRESHOLD - on

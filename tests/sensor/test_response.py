@@ -9,7 +9,7 @@ import torch
 
 from enerf_ns.sensor.response import (
     DEFAULT_CONTRAST_THRESHOLD,
-    color_channels,
+    colour_channels,
     inverse_linlog,
     linlog,
     luma,
@@ -66,7 +66,7 @@ def test_luma_of_one_channel_is_that_channel():
 @pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "BGGR", "RRGB"])
 def test_every_pixel_sees_the_channel_of_its_filter(pattern: str, width: int, height: int):
     letters = [pattern[2 * (y % 2) + x % 2] for y in range(height) for x in range(width)]
-    channels = color_channels(pattern, width, height)
+    channels = colour_channels(pattern, width, height)
     assert channels.dtype == torch.int64
     assert "".join("RGB"[channel] for channel in channels.tolist()) == "".join(letters)
 
@@ -74,14 +74,14 @@ def test_every_pixel_sees_the_channel_of_its_filter(pattern: str, width: int, he
 @pytest.mark.parametrize("pattern", ["", "RGB", "RGGBR", "RGBW", "rggb"])
 def test_what_is_no_colour_filter_is_refused(pattern: str):
     with pytest.raises(ValueError, match="four letters"):
-        color_channels(pattern, 4, 4)
+        colour_channels(pattern, 4, 4)
 
 
 def test_a_mosaic_is_that_of_opencv_demosaiced():
     """OpenCV leaves the channel that a pixel sees as it is; it names patterns by the pixels (1, 1) to (2, 2)."""
     mosaic = np.random.default_rng(0).integers(0, 256, (8, 10), dtype=np.uint8)
     rgb = torch.from_numpy(cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2RGB)).float()
-    seen = pixel_brightness(rgb, color_channels("RGGB", 10, 8).reshape(8, 10))
+    seen = pixel_brightness(rgb, colour_channels("RGGB", 10, 8).reshape(8, 10))
     np.testing.assert_array_equal(seen[1:-1, 1:-1], mosaic[1:-1, 1:-1])
 
 
