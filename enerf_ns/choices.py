@@ -12,7 +12,7 @@ from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, depth_r
 from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.sensor.response import thresholds_from_polarity
+from enerf_ns.sensor.sensor_model import thresholds_from_polarity
 
 if TYPE_CHECKING:
     from enerf_ns.enerf_pipeline import EnerfPipelineConfig

@@ -25,7 +25,8 @@ from torch.nn import Parameter
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
 from enerf_ns.ray_samplers import SharedJitter
-from enerf_ns.sensor.response import linlog, luma, measured_change, pixel_brightness
+from enerf_ns.sensor.response import linlog, luma, pixel_brightness
+from enerf_ns.sensor.sensor_model import measured_change
 from enerf_ns.supervision.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 
 

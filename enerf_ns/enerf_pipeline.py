@@ -19,7 +19,8 @@ from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
-from enerf_ns.sensor.response import linlog, measured_change, pixel_brightness
+from enerf_ns.sensor.response import linlog, pixel_brightness
+from enerf_ns.sensor.sensor_model import measured_change
 
 
 @dataclass

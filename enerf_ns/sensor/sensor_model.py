@@ -66,9 +66,7 @@ class SensorModel(nn.Module):
         """
         return self.contrast_thresholds[0] * on - self.contrast_thresholds[1] * off
 
-    def interval_start(
-        self, first: Int64[Tensor, "*batch"], end: Int64[Tensor, "*batch"]
-    ) -> Int64[Tensor, "*batch"]:
+    def interval_start(self, first: Int64[Tensor, "*batch"], end: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
         """When a pixel that fired can see again, and with it the interval that its next events measure begins (ns).
 
         After an event a pixel is blind for the refractory period, and then compares brightness with what it sees first
@@ -97,3 +95,8 @@ def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
         return DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD
     on = 2.0 * DEFAULT_CONTRAST_THRESHOLD * num_off / (num_on + num_off)
     return on, 2.0 * DEFAULT_CONTRAST_THRESHOLD - on
+
+
+def measured_change(on: Tensor, off: Tensor, thresholds: tuple[float, float]) -> Tensor:
+    """For what does not have a sensor yet."""
+    return thresholds[0] * on - thresholds[1] * off

@@ -15,7 +15,7 @@ from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.events import samplers as event_sampler
 from enerf_ns.events.samplers import EventPairs, EventPairSampler, SilentPixelSampler
-from enerf_ns.sensor.response import measured_change
+from enerf_ns.sensor.sensor_model import measured_change
 
 WIDTH, HEIGHT = 5, 4
 MODES = ["successor", "partner", "window"]
