@@ -6,6 +6,9 @@ it alone, without a traceback.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class UserError(Exception):
     """Something that the user can mend."""
@@ -21,3 +24,16 @@ class FlagError(UserError, ValueError):
 
 class OutputError(UserError):
     """Results cannot be written: the disk is full, or the place exists already or must not be written to."""
+
+
+@contextmanager
+def exit_with_a_sentence() -> Iterator[None]:
+    """Ends the program, where the block ends with something that the user can mend, with a sentence that says it.
+
+    Raises:
+        SystemExit: In place of a `UserError`.
+    """
+    try:
+        yield
+    except UserError as error:
+        raise SystemExit(f"enerf: {error}") from error

@@ -19,7 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.depth_range import estimate_depth_range
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import RecordingError, exit_with_a_sentence
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
@@ -29,6 +29,9 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 EVENTS_FOR_DEPTH = 4_000_000
 """Of more events, so many measure the depth of the scene."""
+
+DEFAULT_HELD_OUT_EVERY = 4
+"""Of every so many frames one is held out."""
 
 NUM_EVENT_PICTURES = 48
 """Cameras along the trajectory that stand in for frames where a recording has none."""
@@ -41,8 +44,9 @@ class EventDataParserConfig(DataParserConfig):
     _target: Type = field(default_factory=lambda: EventDataParser)  # noqa: UP006
     data: Path = Path()
     """Folder of the recording. It is only ever read."""
-    held_out_every: int = 4
-    """Every so many frames one is kept from training, for evaluation. 1: all, for learning from events alone."""
+    held_out_every: Optional[int] = None  # noqa: UP045
+    """Every so many frames one is kept from training, for evaluation. 1: all, for learning from events alone. None: 4,
+    unless a preset selects frames."""
     train_frames: Literal["blurred", "sharp"] = "blurred"
     """Which frames to train on, where the recording has both; evaluation is always on sharp ones."""
     depth_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
@@ -123,10 +127,8 @@ class EventDataParser(DataParser):
         return read_recording(config.data, FORMATS[type(config)], *selection, **options)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        try:
+        with exit_with_a_sentence():
             return self.outputs(self.recording(), split)
-        except UserError as error:
-            raise SystemExit(f"enerf: {error}") from error
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
         """Cameras of one split, and the box, as Nerfstudio wants them.
@@ -245,7 +247,8 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
     elif recording.held_out_frames:
         evaluated = np.zeros_like(used)
     else:
-        evaluated = used & ((np.cumsum(used) - 1) % config.held_out_every == config.held_out_every // 2)
+        every = DEFAULT_HELD_OUT_EVERY if config.held_out_every is None else config.held_out_every
+        evaluated = used & ((np.cumsum(used) - 1) % every == every // 2)
     if held_out:
         chosen = evaluated
     elif config.train_frame_indices is not None:

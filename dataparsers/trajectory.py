@@ -74,7 +74,9 @@ class Trajectory:
         """Which times (ns) lie between the first and the last pose, both included."""
         return (times >= self.start) & (times <= self.end)
 
-    def poses(self, times: Int64[Tensor, "*batch"]) -> Float64[Tensor, "*batch 3 4"]:
+    def poses(
+        self, times: Int64[Tensor, "*batch"], delays: Float64[Tensor, "*batch"] | None = None
+    ) -> Float64[Tensor, "*batch 3 4"]:
         """Camera-to-world matrices [R | t] (OpenCV axes, metres) at the given times, on their device.
 
         With segment i from t_i to t_{i+1}, its rotation axis k (camera axes) and angle, and phi the part of the angle
@@ -82,10 +84,16 @@ class Trajectory:
 
         Args:
             times: Nanoseconds.
+            delays: Nanoseconds, of any sign, that are added to the times; the poses are differentiable in them. None:
+                none.
 
         Raises:
             ValueError: A time outside [start, end].
         """
+        fraction = None
+        if delays is not None:
+            whole = delays.detach().round()
+            times, fraction = times + whole.long(), (delays - whole).flatten()
         if times.numel() and not self.covers(times).all():
             raise ValueError(
                 f"Poses were asked for times from {times.min().item() * 1e-9:.6f} s to {times.max().item() * 1e-9:.6f} "
@@ -95,6 +103,8 @@ class Trajectory:
         flat = times.flatten().contiguous()
         segment = torch.searchsorted(knots, flat, right=True).sub_(1).clamp_(max=len(angles) - 1)
         passed = (flat - knots[segment]).double()
+        if fraction is not None:
+            passed = passed + fraction
         duration = (knots[1:] - knots[:-1])[segment]
         phi = (angles[segment] * passed / duration)[:, None, None]
         poses = flat.new_empty((len(flat), 3, 4), dtype=torch.float64)

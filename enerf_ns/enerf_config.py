@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
-import numpy as np
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from enerf_ns.choices import MethodDefaults
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.ffmpeg import make_ffmpeg_available
 
 
 @dataclass
@@ -38,21 +36,6 @@ class DecayOverRunSchedulerConfig(ExponentialDecaySchedulerConfig):
     """Step at which lr_final is reached. None: the last step of the run."""
 
 
-def allow_numpy_scalars_in_checkpoints() -> None:
-    """Let torch 2.6 and later load the learning rates that Nerfstudio's scheduler stores as NumPy scalars."""
-    scalar: Any = np.float64(0).__reduce__()[0]
-    torch.serialization.add_safe_globals(
-        [
-            scalar,
-            (scalar, "numpy.core.multiarray.scalar"),
-            (scalar, "numpy._core.multiarray.scalar"),
-            np.dtype,
-            type(np.dtype(np.float64)),
-            type(np.dtype(np.float32)),
-        ]
-    )
-
-
 def method_config(
     name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
 ) -> EnerfTrainerConfig:
@@ -71,7 +54,11 @@ def method_config(
             "fields": {
                 "optimizer": FusedAdamOptimizerConfig(lr=learning_rate, eps=1e-15),
                 "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * learning_rate),
-            }
+            },
+            "sensor": {
+                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
+                "scheduler": DecayOverRunSchedulerConfig(lr_final=1e-4),
+            },
         },
         viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer",
@@ -80,9 +67,6 @@ def method_config(
 
 RAYS_PER_CHUNK = 1 << (15 if torch.cuda.is_available() else 12)
 """Rays rendered at once: enough to keep the device busy, few enough for the cache of a CPU."""
-
-make_ffmpeg_available()
-allow_numpy_scalars_in_checkpoints()
 
 enerf = MethodSpecification(
     config=method_config(
@@ -96,19 +80,23 @@ enerf = MethodSpecification(
     description="E-NeRF: radiance field from an event camera, tuned for error against time.",
 )
 
+PAPER = MethodDefaults(
+    event_pairs=30096,
+    silent_pairs=0,
+    train_num_rays_per_batch=30096,
+    event_loss="squared",
+    no_event_loss_weight=5.0,  # 1 / C at the paper's C = 0.2: its weight of 1
+    no_event_margin=1.0,
+    paper_batch=True,
+)
+
 enerf_paper = MethodSpecification(
     config=method_config(
         "enerf-paper",
         iterations=100_000,
         learning_rate=5e-3,
         pipeline=EnerfPipelineConfig(
-            datamanager=EnerfDataManagerConfig(
-                event_pairs=30096,
-                pair_mode="successor",
-                uniform_over="pixels",
-                silent_pairs=0,
-                train_num_rays_per_batch=30096,
-            ),
+            datamanager=EnerfDataManagerConfig(pair_mode="successor", uniform_over="pixels"),
             model=EnerfModelConfig(
                 num_levels=16,
                 base_res=16,
@@ -118,20 +106,15 @@ enerf_paper = MethodSpecification(
                 hidden_dim_color=64,
                 view_direction=True,
                 brightness="sigmoid",
-                event_loss="squared",
                 sampling="uniform",
                 num_samples=512,
-                no_event_loss_weight=5.0,  # 1 / C and 1 / C^2 at the paper's C = 0.2: its weights of 1, since losses
-                no_event_margin=1.0,  # here count changes in thresholds
-                frame_loss_weight=25.0,
+                frame_loss_weight=25.0,  # 1 / C^2 at the paper's C = 0.2: its weight of 1, since event losses count C
                 opacity_loss_weight=0.0,
                 distortion_loss_weight=0.0,
                 eval_num_rays_per_chunk=RAYS_PER_CHUNK,
             ),
+            defaults=PAPER,
         ),
     ),
     description="E-NeRF with the sampling and field of the paper (Klenk et al., RA-L 2023).",
 )
-
-METHODS: dict[Any, Any] = {method.config.method_name: deepcopy(method.config) for method in (enerf, enerf_paper)}
-"""Settings of the methods as they are before flags change them."""

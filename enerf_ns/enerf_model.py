@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Annotated, Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
+import tyro
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import (
-    PDFSampler,
     ProposalNetworkSampler,
-    UniformSampler,
 )
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider
@@ -24,10 +23,11 @@ from torch.nn import Parameter
 
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
-from enerf_ns.ray_samplers import SharedJitter
-from enerf_ns.sensor.response import linlog, luma, pixel_brightness
-from enerf_ns.sensor.sensor_model import measured_change
-from enerf_ns.supervision.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
+from enerf_ns.events.batch import TrainBatch
+from enerf_ns.ray_samplers import PairedPDFSampler, PairedUniformSampler, paired_rand
+from enerf_ns.sensor.sensor_model import SensorModelConfig
+from enerf_ns.supervision.event_supervision import EventSupervision
+from enerf_ns.supervision.losses import frame_loss
 
 
 @dataclass
@@ -61,16 +61,18 @@ class EnerfModelConfig(ModelConfig):
     """Samples of the proposal network along a ray."""
     num_samples: int = 24
     """Samples of the field along a ray."""
-    contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
-    """C_on and C_off. None: the recording's own, else from the counts of both polarities."""
-    event_loss: Literal["huber", "squared", "normalised"] = "huber"
-    """Compare changes of brightness in units of the threshold, robustly or squared as in the paper, or up to scale."""
+    sensor: Annotated[SensorModelConfig, tyro.conf.arg(name="")] = field(default_factory=SensorModelConfig)
+    event_loss: Optional[str] = None  # noqa: UP045
+    """Compare changes of brightness in units of the threshold, robustly (huber) or squared as in the paper (squared),
+    or up to scale (normalised). None: huber, squared for enerf-paper, or as the preset."""
     event_loss_weight: float = 1.0
     """Weight of the event loss."""
-    no_event_loss_weight: float = 0.1
-    """Weight of the loss on silent pixels (see datamanager.silent-pairs)."""
-    no_event_margin: float = 0.0
-    """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation."""
+    no_event_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the loss on silent pixels (see datamanager.silent-pairs). None: 0.1, or as the paper for
+    enerf-paper."""
+    no_event_margin: Optional[float] = None  # noqa: UP045
+    """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation. None:
+    0, or as the paper for enerf-paper."""
     frame_loss_weight: float = 10.0
     """Weight of the loss on frames."""
     opacity_loss_weight: float = 1.0
@@ -81,6 +83,13 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the loss by which the proposal network learns."""
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Reads config.yml of runs from before the sensor had a config of its own, too."""
+        thresholds = state.pop("contrast_thresholds", None)
+        if "sensor" not in state:
+            state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
+        self.__dict__.update(state)
 
 
 class BoxCollider(AABBBoxCollider):
@@ -105,9 +114,12 @@ class EnerfModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        assert (
-            config.contrast_thresholds and config.max_res and config.num_channels and config.near_plane is not None
-        ), "enerf_ns.choices fills in what the config leaves open before the model is built"
+        assert config.max_res and config.num_channels and config.near_plane is not None
+        assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
+        self.sensor = config.sensor.setup()
+        self.supervision = EventSupervision(
+            config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
+        )
         aabb = self.scene_box.aabb
         self.collider = BoxCollider(self.scene_box, config.near_plane)
         self.field = EnerfField(
@@ -132,18 +144,20 @@ class EnerfModel(Model):
                 num_proposal_samples_per_ray=(config.num_proposal_samples,),
                 num_nerf_samples_per_ray=config.num_samples,
                 num_proposal_network_iterations=1,
-                initial_sampler=UniformSampler(single_jitter=True),
-                pdf_sampler=PDFSampler(include_original=False, single_jitter=True),
+                initial_sampler=PairedUniformSampler(single_jitter=True),
+                pdf_sampler=PairedPDFSampler(single_jitter=True),
                 update_sched=lambda step: 1 if step > 500 else 0,
             )
         else:
-            self.sampler = UniformSampler(num_samples=config.num_samples)
+            self.sampler = PairedUniformSampler(num_samples=config.num_samples)
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        return {"fields": list(self.field.parameters()) + list(self.proposal.parameters() if self.proposal else [])}
+        groups = {"fields": [*self.field.parameters(), *(self.proposal.parameters() if self.proposal else ())]}
+        sensor = list(self.sensor.parameters())
+        return groups | {"sensor": sensor} if sensor else groups
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -170,19 +184,15 @@ class EnerfModel(Model):
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
-        num_pairs = getattr(ray_bundle, "num_pairs", 0)
-        with SharedJitter(num_pairs):
-            if self.proposal is not None:
-                samples, weights_list, samples_list = self.sampler(ray_bundle, density_fns=[self.proposal.density_fn])
-            else:
-                samples, weights_list, samples_list = self.sampler(ray_bundle), [], []
-            field_outputs = self.field(samples)
-            weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
-            accumulation = self.renderer_accumulation(weights=weights)
-            rgb = field_outputs[FieldHeadNames.RGB]
-            background = torch.zeros_like(accumulation)
-            if self.training:
-                background = torch.rand((len(background), 1), device=background.device)
+        if self.proposal is not None:
+            samples, weights_list, samples_list = self.sampler(ray_bundle, density_fns=[self.proposal.density_fn])
+        else:
+            samples, weights_list, samples_list = self.sampler(ray_bundle), [], []
+        field_outputs = self.field(samples)
+        weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+        accumulation = self.renderer_accumulation(weights=weights)
+        rgb = field_outputs[FieldHeadNames.RGB]
+        background = paired_rand(ray_bundle, 1) if self.training else torch.zeros_like(accumulation)
         color = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
         outputs = {"rgb": color.expand(-1, 3), "accumulation": accumulation}
         with torch.no_grad():
@@ -209,25 +219,17 @@ class EnerfModel(Model):
         gradient = torch.sum(torch.log(density + 1e-6) * corners, dim=1)
         return 0.5 - 0.5 * torch.nn.functional.normalize(gradient, dim=-1)
 
-    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: TrainBatch, metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """All losses, with their weights, of what `get_outputs` made of the rays of a batch."""
         config = self.config
-        num_pairs = batch["num_pairs"]
+        start, end, frames = batch.split(outputs["rgb"])
         losses: dict[str, Tensor] = {}
-        if num_pairs:
-            predicted, measured, num_events = self.brightness_changes(outputs, batch)
-            thresholds = config.contrast_thresholds
-            assert thresholds is not None
-            if config.event_loss == "normalised":
-                loss = normalised_event_loss(predicted[:num_events], measured)
-            else:
-                distance = huber_event_loss if config.event_loss == "huber" else event_loss
-                loss = distance(predicted[:num_events], measured, 0.5 * sum(thresholds))
-            losses["event_loss"] = config.event_loss_weight * loss
-            if num_events < num_pairs:
-                loss = no_event_loss(predicted[num_events:], thresholds, config.no_event_margin)
-                losses["no_event_loss"] = config.no_event_loss_weight * loss
-        if "image" in batch:
-            losses["frame_loss"] = config.frame_loss_weight * self.frame_error(outputs, batch)
+        if batch.events is not None:
+            losses |= self.supervision.losses(start, end, batch.events, self.sensor)
+        if batch.frames is not None:
+            losses["frame_loss"] = config.frame_loss_weight * frame_loss(frames, batch.frames.colours, self.is_grey)
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             if config.opacity_loss_weight:
@@ -238,34 +240,21 @@ class EnerfModel(Model):
                 losses["interlevel_loss"] = config.interlevel_loss_weight * interlevel_loss(weights, samples)
         return losses
 
-    def brightness_changes(self, outputs, batch) -> tuple[Tensor, Tensor, int]:
-        """Rendered changes of log brightness (pairs,), measured ones (event pairs,), and how many pairs have events.
-
-        Behind a colour filter, log brightness is that of the channel that the pixel sees.
-        """
-        num_pairs = batch["num_pairs"]
-        channel = batch["channel"].repeat(2) if "channel" in batch else None
-        log_brightness = linlog(pixel_brightness(outputs["rgb"][: 2 * num_pairs], channel))
-        assert self.config.contrast_thresholds is not None
-        measured = measured_change(batch["on"], batch["off"], self.config.contrast_thresholds)
-        return log_brightness[num_pairs:] - log_brightness[:num_pairs], measured, len(measured)
-
-    def frame_error(self, outputs, batch) -> Tensor:
-        """Mean squared error of the frame rays; in grey where the field is grey, or what was recorded."""
-        rendered, recorded = outputs["rgb"][2 * batch["num_pairs"] :], batch["image"]
-        if self.config.num_channels == 1 or (recorded == recorded[..., :1]).all():
-            rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
-        return frame_loss(rendered, recorded)
-
     @torch.no_grad()
-    def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
-        metrics = {}
-        if batch["num_pairs"]:
-            predicted, measured, num_events = self.brightness_changes(outputs, batch)
-            metrics["event_correlation"] = torch.corrcoef(torch.stack([predicted[:num_events], measured]))[0, 1]
-        if "image" in batch:
-            metrics["frame_psnr"] = -10.0 * torch.log10(self.frame_error(outputs, batch))
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: TrainBatch) -> dict[str, Tensor]:
+        """event_correlation and frame_psnr (dB), each where the batch has it."""
+        start, end, frames = batch.split(outputs["rgb"])
+        metrics: dict[str, Tensor] = {}
+        if batch.events is not None:
+            metrics |= self.supervision.metrics(start, end, batch.events, self.sensor)
+        if batch.frames is not None:
+            metrics["frame_psnr"] = -10.0 * torch.log10(frame_loss(frames, batch.frames.colours, self.is_grey))
         return metrics
+
+    @property
+    def is_grey(self) -> bool:
+        """Whether the field has one channel."""
+        return self.config.num_channels == 1
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
@@ -277,8 +266,7 @@ class EnerfModel(Model):
         recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
         scores: dict[str, float] = {}
         if batch["is_frame"]:
-            bayer_pattern = self.kwargs["metadata"]["recording"].bayer_pattern
-            align = align_channels if bayer_pattern else align_brightness
+            align = align_channels if self.sensor.colour_filter else align_brightness
             rendered = align([rendered], [recorded])[0][0]
             scores = image_metrics(rendered, recorded)
         images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}

@@ -14,13 +14,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import track
 from torch import Tensor
+from tyro.conf import Fixed, Suppress
 
+from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
+from enerf_ns.choices import MethodDefaults, Resolution, resolve
+from enerf_ns.dataparsers.errors import exit_with_a_sentence
+from enerf_ns.dataparsers.event_dataparser import EventDataParser
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
-from enerf_ns.sensor.response import linlog, pixel_brightness
-from enerf_ns.sensor.sensor_model import measured_change
+from enerf_ns.ffmpeg import make_ffmpeg_available
+from enerf_ns.supervision.event_supervision import brightness_change
 
 
 @dataclass
@@ -30,6 +35,28 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
     _target: Type = field(default_factory=lambda: EnerfPipeline)  # noqa: UP006
     datamanager: EnerfDataManagerConfig = field(default_factory=EnerfDataManagerConfig)
     model: EnerfModelConfig = field(default_factory=EnerfModelConfig)
+    defaults: Fixed[Suppress[MethodDefaults]] = field(default_factory=MethodDefaults)
+    """What is used where neither flag nor preset says otherwise."""
+    resolution: Fixed[Suppress[Resolution]] = field(default_factory=Resolution)
+    """What was chosen for the recording, and why; empty before that."""
+
+    def setup(self, **kwargs: Any) -> EnerfPipeline:
+        """The pipeline, with what the resolution says in place of what is open here.
+
+        Raises:
+            SystemExit: The recording cannot be used, or not so; with one sentence.
+        """
+        make_ffmpeg_available()
+        allow_numpy_scalars_in_checkpoints()
+        with exit_with_a_sentence():
+            resolution = self.resolution
+            if not resolution.choices:
+                resolution = resolve(self, EventDataParser(self.datamanager.dataparser).recording())
+            return self._target(resolution.applied_to(self), **kwargs)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Reads config.yml of runs from before choices were stored apart from what was set, too."""
+        self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), **state})
 
 
 @dataclass
@@ -59,6 +86,22 @@ class EnerfPipeline(VanillaPipeline):
     @property
     def model(self) -> EnerfModel:
         return super().model  # type: ignore
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs, losses and metrics of the next batch."""
+        sensor = self.model.sensor
+        batch = self.datamanager.next_batch(sensor)
+        outputs = self._model(self.datamanager.rays(batch, sensor))
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+
+    def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+        """As `get_train_loss_dict`, rendered as in evaluation."""
+        self.eval()
+        with torch.no_grad():
+            results = self.get_train_loss_dict(step)
+        self.train()
+        return results
 
     @torch.no_grad()
     def held_out_views(self) -> tuple[list[HeldOutView], dict[str, float]]:
@@ -121,17 +164,14 @@ class EnerfPipeline(VanillaPipeline):
         What can be said of a field whose recording has no frames; the pairs are drawn from those of the training.
         """
         self.eval()
-        manager, thresholds = self.datamanager, self.model.config.contrast_thresholds
-        assert thresholds is not None
-        manager.setup_events(manager.eval_dataset.recording)
+        manager, sensor = self.datamanager, self.model.sensor
         generator = torch.Generator(self.device).manual_seed(0)
-        pairs = manager.pair_sampler.sample(num_pairs, generator)
-        rays = manager.event_rays(pairs.pixels.repeat(2), torch.cat([pairs.start, pairs.end])).reshape((2, num_pairs))
-        rendered = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
-        channel = None if manager.pixel_channels is None else manager.pixel_channels[pairs.pixels].expand(2, -1)
-        start, end = linlog(pixel_brightness(rendered, channel))
+        batch = manager.pair_sampler.sample(num_pairs, generator)
+        rays = manager.event_rays(batch, sensor).reshape((2, num_pairs))
+        start, end = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
         self.train()
-        return correlation(end - start, measured_change(pairs.on, pairs.off, thresholds))
+        change = brightness_change(start, end, batch, sensor)
+        return correlation(change, sensor.measured_change(batch.on, batch.off, batch.pixels))
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

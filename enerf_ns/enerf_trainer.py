@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from enerf_ns.choices import Choice, absolute, fill_in_choices
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.choices import Choice, resolve
+from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, scene_normalisation
+from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
-from enerf_ns.paper_selections import PresetName, apply_preset
 
 
 @dataclass
@@ -28,62 +30,61 @@ class EnerfTrainerConfig(TrainerConfig):
 
     _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
-    preset: Optional[PresetName] = None  # noqa: UP045
-    """The selections of the E-NeRF paper for one of its sequences; flags that are set stand."""
+    preset: Optional[str] = None  # noqa: UP045
+    """The selections of the E-NeRF paper for one of its sequences; flags that are set stand. One of eds00, eds11,
+    mocap-1d-trans, mocap-desk2, mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse,
+    spiral1-more-sparse, spiral2."""
 
-    def prepare(self) -> tuple[EventRecording, list[str], list[Choice]]:
-        """Read the recording and fill in what is open: paths, decay of the learning rate, preset, choices.
-
-        Returns:
-            The recording, what to say about the preset, and the choices.
+    def resolved(self) -> EnerfTrainerConfig:
+        """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
+        recording (`pipeline.resolution`), whose events are read and checked.
 
         Raises:
-            RecordingError: if the recording cannot be used. Nothing has been written then.
+            RecordingError: The recording cannot be used.
+            FlagError: A setting cannot be followed.
         """
-        manager = self.pipeline.datamanager
-        if self.data is None:
-            self.data = manager.data
-        if self.data is None and manager.dataparser.data != Path():
-            self.data = manager.dataparser.data
-        if self.data is None:
-            raise RecordingError("--data is missing; give the folder of a recording")
-        self.data = manager.data = manager.dataparser.data = absolute(self.data)
-        self.output_dir = absolute(self.output_dir)
-        for group in self.optimizers.values():
+        config = deepcopy(self)
+        pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
+        data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
+        if data is None:
+            raise FlagError("--data is missing; give the folder of a recording")
+        config.data = pipeline.datamanager.data = parser.data = data.expanduser().resolve()
+        config.output_dir = self.output_dir.expanduser().resolve()
+        for group in config.optimizers.values():
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
-        recording = EventDataParser(manager.dataparser).recording()
-        selection: list[str] = []
-        if self.preset is not None:
-            from enerf_ns.enerf_config import METHODS  # here, since it imports this module
+        if not pipeline.resolution.choices:
+            recording = EventDataParser(parser).recording()
+            pipeline.resolution = resolve(pipeline, recording, self.preset)
+        index_events(config.recording())
+        return config
 
-            selection = apply_preset(self, METHODS[self.method_name], recording)
-            recording = EventDataParser(manager.dataparser).recording()
-        choices = fill_in_choices(self.pipeline, recording)
-        index_events(recording)
-        return recording, selection, choices
+    def recording(self) -> EventRecording:
+        """What is learnt from, of a config that is resolved."""
+        return EventDataParser(self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser).recording()
 
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""
-        try:
-            recording, selection, choices = self.prepare()
-        except UserError as error:
-            raise SystemExit(f"enerf: {error}") from error
-        CONSOLE.print(recording_table(recording, self))
-        for line in selection:
-            CONSOLE.print(f"* {line}", highlight=False)
-        CONSOLE.print(choices_table(choices))
-        super().save_config()
-        (self.get_base_dir() / "choices.json").write_text(json.dumps([asdict(choice) for choice in choices], indent=2))
+        with exit_with_a_sentence():
+            config = self.resolved()
+            CONSOLE.print(recording_table(config))
+        resolution = config.pipeline.resolution
+        for line in resolution.selection:
+            CONSOLE.print(f"* {line}", highlight=False, markup=False)
+        CONSOLE.print(choices_table(resolution.choices))
+        super(EnerfTrainerConfig, config).save_config()
+        choices = [asdict(choice) for choice in resolution.choices]
+        write_whole(config.get_base_dir() / "choices.json", json.dumps(choices, indent=2))
+
+    def setup(self, **kwargs: Any) -> EnerfTrainer:
+        """The trainer, of what this config comes to on its recording."""
+        with exit_with_a_sentence():
+            return self._target(self.resolved(), **kwargs)
 
 
 class EnerfTrainer(Trainer):
     """Nerfstudio's trainer, ending with a list of what was made."""
 
     config: EnerfTrainerConfig
-
-    def setup(self, test_mode="val") -> None:
-        self.config.prepare()
-        super().setup(test_mode)
 
     def _after_train(self) -> None:
         super()._after_train()
@@ -99,12 +100,13 @@ class EnerfTrainer(Trainer):
             CONSOLE.print(f"[bold]{what}:[/bold] {where}", soft_wrap=True, highlight=False)
 
 
-def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Table:
-    """What the recording holds."""
+def recording_table(config: EnerfTrainerConfig) -> Table:
+    """What the recording of a resolved config holds."""
+    recording = config.recording()
     index, camera = index_events(recording), recording.camera
     first, last = index.span
     seconds = max(last - first, 1) * 1e-9
-    parser = config.pipeline.datamanager.dataparser
+    parser = config.pipeline.resolution.applied_to(config.pipeline).datamanager.dataparser
     depth = parser.depth_range
     rows = {
         "folder": f"{recording.path} ({recording.format})",
@@ -135,7 +137,7 @@ def recording_table(recording: EventRecording, config: EnerfTrainerConfig) -> Ta
     return table
 
 
-def choices_table(choices: list[Choice]) -> Table:
+def choices_table(choices: Sequence[Choice]) -> Table:
     """What is kept and what is left out, and why."""
     table = Table(title="Parts of the method", title_justify="left")
     for column in ("part", "", "what", "why"):

@@ -10,29 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.recording import EventRecording, Frames
-
-if TYPE_CHECKING:
-    from enerf_ns.enerf_trainer import EnerfTrainerConfig  # which imports this module
-
-PresetName = Literal[
-    "eds00",
-    "eds11",
-    "mocap1dtrans",
-    "mocapDesk2",
-    "mocapDesk2_6Views",
-    "shakeCarpet1",
-    "shakeMoon1",
-    "shakeMoon2",
-    "spiral1",
-    "spiral1_sparse",
-    "spiral1_more_sparse",
-    "spiral2",
-]
 
 
 @dataclass(frozen=True)
@@ -94,7 +76,7 @@ ALL_EVENTS = (
 SPIRAL_1 = (*range(0, 5, 2), *range(8, 37, 2), *range(42, 65, 2))
 FRAMES_ALONE_30096 = "Where it learns from frames alone, the reference draws 30096 frame pixels a step, not 20096."
 
-PRESETS: dict[PresetName, Preset] = {
+PRESETS: dict[str, Preset] = {
     "eds00": Preset(  # 00_peanuts_dark
         train_frames=tuple(range(430, 971, 10)),
         held_out_frames=tuple(range(425, 966, 30)),
@@ -136,7 +118,7 @@ PRESETS: dict[PresetName, Preset] = {
             "and 20096 pairs and frame pixels a step.",
         ),
     ),
-    "mocap1dtrans": Preset(  # mocap-1d-trans
+    "mocap-1d-trans": Preset(  # mocap-1d-trans
         train_frames=tuple(range(50, 401, 10)),
         held_out_frames=without(range(50, 401, 5), range(50, 401, 10)),
         scale=0.5,
@@ -160,7 +142,7 @@ PRESETS: dict[PresetName, Preset] = {
             "times that of the paper, since it is per threshold.",
         ),
     ),
-    "mocapDesk2": Preset(  # mocap-desk2
+    "mocap-desk2": Preset(  # mocap-desk2
         train_frames=tuple(range(50, 411, 20)),
         held_out_frames=tuple(range(60, 401, 20)),
         scale=0.5,
@@ -172,7 +154,7 @@ PRESETS: dict[PresetName, Preset] = {
         mended=(ALL_EVENTS,),
         notes=("The paper counts 60 train frames, its configs have the 19 used here.",),
     ),
-    "mocapDesk2_6Views": Preset(  # mocap-desk2
+    "mocap-desk2-6views": Preset(  # mocap-desk2
         train_frames=tuple(range(50, 401, 70)),
         held_out_frames=without(range(60, 401, 20), range(50, 401, 70)),
         scale=0.5,
@@ -186,7 +168,7 @@ PRESETS: dict[PresetName, Preset] = {
             ALL_EVENTS,
         ),
     ),
-    "shakeCarpet1": Preset(
+    "shake-carpet1": Preset(
         train_frames=tuple(range(0, 41, 2)),
         held_out_frames=tuple(range(1, 40, 2)),
         scale=0.3,
@@ -205,7 +187,7 @@ PRESETS: dict[PresetName, Preset] = {
             FRAMES_ALONE_30096,
         ),
     ),
-    "shakeMoon1": Preset(
+    "shake-moon1": Preset(
         train_frames=tuple(range(0, 65, 2)),
         held_out_frames=tuple(range(1, 64, 2)),
         scale=0.3,
@@ -220,7 +202,7 @@ PRESETS: dict[PresetName, Preset] = {
             FRAMES_ALONE_30096,
         ),
     ),
-    "shakeMoon2": Preset(
+    "shake-moon2": Preset(
         train_frames=tuple(range(0, 77, 2)),
         held_out_frames=tuple(range(1, 76, 2)),
         scale=0.3,
@@ -249,7 +231,7 @@ PRESETS: dict[PresetName, Preset] = {
         frame_rays=30096,
         contrast_thresholds=(0.2, 0.2),
     ),
-    "spiral1_sparse": Preset(
+    "spiral1-sparse": Preset(
         train_frames=tuple(range(0, 65, 4)),
         held_out_frames=tuple(range(1, 64, 2)),
         scale=0.3,
@@ -264,7 +246,7 @@ PRESETS: dict[PresetName, Preset] = {
         ),
         notes=("Where it learns from events and frames, the reference has a threshold of 0.2 and no normalised loss.",),
     ),
-    "spiral1_more_sparse": Preset(
+    "spiral1-more-sparse": Preset(
         train_frames=tuple(range(0, 57, 7)),
         held_out_frames=without(range(1, 64, 2), range(0, 57, 7)),
         scale=0.3,
@@ -291,7 +273,7 @@ PRESETS: dict[PresetName, Preset] = {
         contrast_thresholds=(0.2, 0.2),
     ),
 }
-"""By the names of the reference's configs."""
+"""By the names of the data sets' sequences."""
 
 
 def event_time_range(
@@ -314,44 +296,49 @@ def event_time_range(
     return start * 1e-9, end * 1e-9
 
 
-def apply_preset(config: EnerfTrainerConfig, defaults: EnerfTrainerConfig, recording: EventRecording) -> list[str]:
-    """Fill in the selections of `config.preset` where the user left the method's default; what he set stands.
-
-    Batch sizes are the paper's only for the method enerf-paper: for enerf they would make a step some twenty times as
-    long. Where a preset has been applied already, nothing changes.
-
-    Args:
-        config: Changed in place.
-        defaults: The method as registered.
-        recording: The sequence of the preset, with all its frames.
-
-    Returns:
-        What to show: the selection, what the user set otherwise, what was mended.
+def preset_named(name: str) -> str:
+    """The name of a preset as it is written here; spellings of the reference's configs, such as mocapDesk2, are known.
 
     Raises:
-        RecordingError: if the recording has not the frames that the preset selects.
+        FlagError: There is none of this name.
     """
-    assert config.preset is not None
-    preset = PRESETS[config.preset]
-    kept: list[str] = []
+    known = {preset.replace("-", "").lower(): preset for preset in PRESETS}
+    found = known.get(name.replace("-", "").replace("_", "").lower())
+    if found is None:
+        raise FlagError(f"--preset {name} is not known; give one of {', '.join(PRESETS)}.")
+    return found
 
-    def fill_in(section: str, **values: Any) -> None:
-        part, default = attrgetter(section)(config), attrgetter(section)(defaults)
-        for name, value in values.items():
-            if getattr(part, name) == getattr(default, name):
-                setattr(part, name, value)
-            elif getattr(part, name) != value:
-                kept.append("--" + name.replace("_", "-"))
 
-    parser = config.pipeline.datamanager.dataparser
-    if parser.held_out_every == defaults.pipeline.datamanager.dataparser.held_out_every:
-        section = "pipeline.datamanager.dataparser"
-        fill_in(section, train_frame_indices=without(preset.train_frames, parser.held_out_frame_indices or ()))
-        fill_in(section, held_out_frame_indices=without(preset.held_out_frames, parser.train_frame_indices or ()))
-    else:
-        kept.append("--held-out-every")
-    train = parser.train_frame_indices or preset.train_frames
-    held_out = parser.held_out_frame_indices or preset.held_out_frames
+def selections(
+    name: str, recording: EventRecording, parser: EventDataParserConfig, paper_batch: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """What a preset says of the settings of a pipeline, and what to show of it.
+
+    Args:
+        name: Of the preset.
+        recording: The sequence of the preset, with all its frames.
+        parser: What the user set; of frames that he chose for one use, none is selected for the other, and where he
+            holds out every so many, none is selected at all.
+        paper_batch: Whether the batch sizes are the paper's; with them a step of the method enerf takes some twenty
+            times as long.
+
+    Returns:
+        The settings by their names within the config of the pipeline, and sentences: the selection, what was mended.
+
+    Raises:
+        RecordingError: The recording has not the frames that the preset selects.
+    """
+    preset = PRESETS[name]
+    values: dict[str, Any] = {}
+    if parser.held_out_every is None:
+        values["datamanager.dataparser.train_frame_indices"] = without(
+            preset.train_frames, parser.held_out_frame_indices or ()
+        )
+        values["datamanager.dataparser.held_out_frame_indices"] = without(
+            preset.held_out_frames, parser.train_frame_indices or ()
+        )
+    train = parser.train_frame_indices or without(preset.train_frames, parser.held_out_frame_indices or ())
+    held_out = parser.held_out_frame_indices or without(preset.held_out_frames, parser.train_frame_indices or ())
     frames = recording.frames or recording.blurred_frames
     numbers = frames.numbers.tolist() if frames else []
     with_pose = [number for number in train if number in numbers]
@@ -359,46 +346,41 @@ def apply_preset(config: EnerfTrainerConfig, defaults: EnerfTrainerConfig, recor
     if frames is None or len(numbers) < 2 or not with_pose or missing:
         found = f"the frames {numbers[0]} to {numbers[-1]}" if numbers else "no frames"
         raise RecordingError(
-            f"{recording.path}: --preset {config.preset} selects from the frames {min(*train, *held_out)} to "
+            f"{recording.path}: --preset {name} selects from the frames {min(*train, *held_out)} to "
             f"{max(*train, *held_out)}, but the recording has {found} with poses; give the whole sequence, or choose "
             "by --train-frame-indices and --held-out-frame-indices of the data parser"
         )
     start, end = event_time_range(frames, with_pose, preset.event_window)
-    fill_in(
-        "pipeline.datamanager.dataparser",
-        box=preset.box,
-        depth_range=preset.depth_range,
-        time_range=(start, end),
-    )
-    fill_in("pipeline.datamanager", silence_ms=preset.silence_ms)
+    values |= {
+        "datamanager.dataparser.box": preset.box,
+        "datamanager.dataparser.depth_range": preset.depth_range,
+        "datamanager.dataparser.time_range": (start, end),
+        "datamanager.silence_ms": preset.silence_ms,
+    }
     if preset.contrast_thresholds is None:
-        fill_in("pipeline.model", event_loss="normalised")
+        values["model.event_loss"] = "normalised"
     else:
-        fill_in("pipeline.model", contrast_thresholds=preset.contrast_thresholds)
+        values["model.sensor.contrast_thresholds"] = preset.contrast_thresholds
     if preset.silent_pairs:
         assert preset.contrast_thresholds is not None
         # The losses count changes in thresholds: squared ones for events, plain ones for silent pixels.
         weight = preset.no_event_weight / (0.5 * sum(preset.contrast_thresholds))
-        fill_in("pipeline.model", no_event_loss_weight=weight, no_event_margin=1.0)
-    paper_batch = defaults.method_name == "enerf-paper"
+        values |= {"model.no_event_loss_weight": weight, "model.no_event_margin": 1.0}
     if paper_batch:
-        fill_in(
-            "pipeline.datamanager",
-            event_pairs=preset.event_pairs,
-            silent_pairs=preset.silent_pairs,
-            train_num_rays_per_batch=preset.frame_rays,
-        )
+        values |= {
+            "datamanager.event_pairs": preset.event_pairs,
+            "datamanager.silent_pairs": preset.silent_pairs,
+            "datamanager.train_num_rays_per_batch": preset.frame_rays,
+        }
 
     x, y, z, half = preset.box
     lines = [
-        f"Preset {config.preset}: {len(preset.train_frames)} train and {len(preset.held_out_frames)} held-out frames, "
+        f"Preset {name}: {len(preset.train_frames)} train and {len(preset.held_out_frames)} held-out frames, "
         f"events from {start:.3f} s to {end:.3f} s, a cube of {2.0 * half:.3g} m around ({x:.3g}, {y:.3g}, {z:.3g}) m."
     ]
     if not paper_batch:
         lines.append(
-            f"The batch, silent pixels included, is the one that {defaults.method_name} is tuned for; the preset's "
+            "The batch, silent pixels included, is the one that the method is tuned for; the preset's "
             f"{preset.event_pairs} event pairs a step are for a GPU and the method enerf-paper."
         )
-    if kept:
-        lines.append(f"Set by flag, not by the preset: {', '.join(kept)}.")
-    return [*lines, *preset.mended, *preset.notes]
+    return values, [*lines, *preset.mended, *preset.notes]

@@ -1,36 +1,116 @@
-"""What the two rays of an event pair have in common while they are sampled."""
+"""Samplers along rays for which the two rays of a pair are one: the change between them holds no noise of sampling."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from nerfstudio.cameras.rays import RayBundle
-from torch.overrides import TorchFunctionMode
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import PDFSampler, UniformSampler
+from torch import Tensor
 
 
 @dataclass
 class PairedRayBundle(RayBundle):
-    """Rays of shape (2 * num_pairs + frame rays): all starts, all ends, then the rays of frames."""
+    """Rays of shape (2 * num_pairs + others): the first ones of all pairs, the second ones, then rays on their own."""
 
     num_pairs: int = 0
 
 
-class SharedJitter(TorchFunctionMode):
-    """Within it, both rays of every pair draw the same random numbers.
+def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
+    """Random numbers in [0, 1), a row for each ray; those of the two rays of a pair are the same.
 
-    Any Nerfstudio sampler draws its jitter with `torch.rand((rays, ...))`; here the second `num_pairs` rows repeat the
-    first, so that the change of brightness between the two rays holds no noise of the sampling.
+    Args:
+        rays: A `PairedRayBundle`, or any other, whose rays are all on their own.
+        columns: Numbers a ray.
     """
+    pairs = getattr(rays, "num_pairs", 0)
+    drawn = torch.rand((len(rays) - pairs, columns), device=rays.origins.device)
+    return torch.cat([drawn[:pairs], drawn]) if pairs else drawn
 
-    def __init__(self, num_pairs: int):
-        super().__init__()
-        self.num_pairs = num_pairs
 
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
-        if func is torch.rand and self.num_pairs:
-            rays, *rest = args[0]
-            drawn = func((rays - self.num_pairs, *rest), **kwargs)
-            return torch.cat([drawn[: self.num_pairs], drawn])
-        return func(*args, **kwargs)
+class PairedUniformSampler(UniformSampler):
+    """Nerfstudio's UniformSampler; in training, both rays of a pair get the same jitter."""
+
+    def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
+        """Samples evenly spaced between near and far end, each moved at random within its stretch in training.
+
+        Args:
+            ray_bundle: With nears and fars.
+            num_samples: A ray.
+        """
+        if not self.training:
+            return super().generate_ray_samples(ray_bundle, num_samples)
+        num_samples = num_samples or self.num_samples
+        assert ray_bundle is not None and num_samples is not None
+        near, far = ray_bundle.nears, ray_bundle.fars
+        assert near is not None and far is not None
+        edges = torch.linspace(0.0, 1.0, num_samples + 1, device=near.device)[None]
+        middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
+        lower, upper = torch.cat([edges[:, :1], middles], -1), torch.cat([middles, edges[:, -1:]], -1)
+        jitter = paired_rand(ray_bundle, 1 if self.single_jitter else num_samples + 1)
+        return _samples(ray_bundle, lower + (upper - lower) * jitter, lambda x: x * far + (1 - x) * near)
+
+
+class PairedPDFSampler(PDFSampler):
+    """Nerfstudio's PDFSampler without its original samples; in training, both rays of a pair get the same jitter."""
+
+    def __init__(self, single_jitter: bool = False):
+        super().__init__(include_original=False, single_jitter=single_jitter)
+
+    def generate_ray_samples(
+        self,
+        ray_bundle: RayBundle | None = None,
+        ray_samples: RaySamples | None = None,
+        weights: Float[Tensor, "*batch num_samples 1"] | None = None,
+        num_samples: int | None = None,
+        eps: float = 1e-5,
+    ) -> RaySamples:
+        """Samples distributed as the weights of earlier ones: their cumulative sum, inverted at stratified heights.
+
+        Args:
+            ray_bundle: The rays.
+            ray_samples: The earlier samples.
+            weights: Of the earlier samples, 0 or more.
+            num_samples: A ray.
+            eps: Least sum of the weights of a ray.
+        """
+        if not self.training:
+            return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
+        num_samples = num_samples or self.num_samples
+        assert ray_bundle is not None and ray_samples is not None and weights is not None and num_samples is not None
+        assert ray_samples.spacing_starts is not None and ray_samples.spacing_ends is not None
+        assert ray_samples.spacing_to_euclidean_fn is not None
+        weights = weights[..., 0] + self.histogram_padding
+        total = weights.sum(dim=-1, keepdim=True)
+        padding = torch.relu(eps - total)
+        density = (weights + padding / weights.shape[-1]) / (total + padding)
+        cumulative = density.cumsum(dim=-1).clamp(max=1.0)
+        cumulative = torch.cat([torch.zeros_like(cumulative[..., :1]), cumulative], dim=-1)
+
+        edges = num_samples + 1
+        jitter = paired_rand(ray_bundle, 1 if self.single_jitter else edges) / edges
+        heights = (torch.linspace(0.0, 1.0 - 1.0 / edges, edges, device=jitter.device) + jitter).contiguous()
+
+        bins = torch.cat([ray_samples.spacing_starts[..., 0], ray_samples.spacing_ends[..., -1:, 0]], dim=-1)
+        above = torch.searchsorted(cumulative, heights, side="right")
+        below = (above - 1).clamp(0, bins.shape[-1] - 1)
+        above = above.clamp(0, bins.shape[-1] - 1)
+        low, high = cumulative.gather(-1, below), cumulative.gather(-1, above)
+        share = torch.nan_to_num((heights - low) / (high - low), 0).clip(0, 1)
+        first, second = bins.gather(-1, below), bins.gather(-1, above)
+        bins = (first + share * (second - first)).detach()
+        return _samples(ray_bundle, bins, ray_samples.spacing_to_euclidean_fn)
+
+
+def _samples(rays: RayBundle, bins: Float[Tensor, "rays edges"], to_distance) -> RaySamples:
+    """Samples between the edges of bins, which are in [0, 1]."""
+    distances = to_distance(bins)
+    return rays.get_ray_samples(
+        bin_starts=distances[..., :-1, None],
+        bin_ends=distances[..., 1:, None],
+        spacing_starts=bins[..., :-1, None],
+        spacing_ends=bins[..., 1:, None],
+        spacing_to_euclidean_fn=to_distance,
+    )

@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Int32
 from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.events.batch import EventBatch
 
 CHUNK = 2**20
 """Events looked at together while the pairs are counted, so that this needs little memory beside the index."""
-
-
-@dataclass(frozen=True)
-class EventPairs:
-    """A batch of pixels, each with two instants and the events that it fired between them, the second included."""
-
-    pixels: Int64[Tensor, " batch"]
-    """y * width + x"""
-    start: Int64[Tensor, " batch"]
-    """First instant, ns."""
-    end: Int64[Tensor, " batch"]
-    """Second instant, ns; later than the first."""
-    on: Int64[Tensor, " batch"]
-    """Number of positive events."""
-    off: Int64[Tensor, " batch"]
-    """Number of negative events."""
-
-    def __len__(self) -> int:
-        return len(self.pixels)
 
 
 class EventPairSampler:
@@ -45,10 +26,9 @@ class EventPairSampler:
     * window: time is cut into windows of `window_ns` from the first event on, and the pair is (i, last instant of this
       pixel in the same window), the 60 ms ablation of E-NeRF.
 
-    After an event a pixel is blind for the refractory period, and then compares brightness with what it sees first
-    (Robust e-NeRF, ICCV 2023): the interval that a pair measures begins that much after its first event, but at least
-    1 ns before its last one. This is exact for pairs of successors. Between the events of other pairs the pixel is
-    blind too, and what changes meanwhile is missing from the sum of their events: these pairs are approximate.
+    Where pixels are blind for a while after an event (`SensorModel.blind_after`), pairs of successors are exact.
+    Between the events of other pairs the pixel is blind too, and what changes meanwhile is missing from the sum of
+    their events: these pairs are approximate.
 
     Args:
         index: The events; batches come out on its device.
@@ -57,7 +37,6 @@ class EventPairSampler:
         window_ns: For mode window, at least 1.
         uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are, and so
             are all pairs of a pixel.
-        refractory_ns: Refractory period of the pixels, 0 for none.
 
     Raises:
         ValueError: There is no pair to draw, or an argument is outside its range.
@@ -70,7 +49,6 @@ class EventPairSampler:
         max_distance: int = 30,
         window_ns: int = 60_000_000,
         uniform_over: Literal["pairs", "pixels"] = "pairs",
-        refractory_ns: int = 0,
     ):
         if max_distance < 1 or window_ns < 1:
             raise ValueError(
@@ -79,7 +57,6 @@ class EventPairSampler:
         self.index = index
         self.window = mode == "window"
         self.max_distance = 1 if mode == "successor" else max_distance
-        self.refractory_ns = refractory_ns
 
         instants = _last_of_each(index)
         if self.window:
@@ -106,7 +83,7 @@ class EventPairSampler:
             raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
         self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> EventPairs:
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
         """Draws `batch_size` pairs with replacement; the generator lives on the device of the index."""
         device = self.index.times.device
         if self._active is None:
@@ -118,9 +95,8 @@ class EventPairSampler:
             pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
         start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
         on = (self.index.positives[end] - self.index.positives[start]).long()
-        end_time = self.index.times[end]
-        start_time = torch.minimum(self.index.times[start] + self.refractory_ns, end_time - 1)
-        return EventPairs(pixels, start_time, end_time, on, end - start - on)
+        silent = torch.zeros_like(pixels, dtype=torch.bool)
+        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on, silent)
 
     def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         start = self._starts[pair]
@@ -158,7 +134,6 @@ class SilentPixelSampler:
         start_ns, end_ns: First and last instant that may be drawn.
         min_duration_ns: At least 1.
         max_duration_ns: At least 2.
-        refractory_ns: For how long a pixel is blind after an event.
 
     Raises:
         ValueError: A duration is shorter than that.
@@ -173,7 +148,6 @@ class SilentPixelSampler:
         end_ns: int,
         min_duration_ns: int,
         max_duration_ns: int,
-        refractory_ns: int = 0,
     ):
         if min_duration_ns < 1 or max_duration_ns < 2:
             raise ValueError(
@@ -183,20 +157,24 @@ class SilentPixelSampler:
         self.index = index
         self.start_ns, self.end_ns = start_ns, end_ns
         self.min_duration_ns, self.max_duration_ns = min_duration_ns, max_duration_ns
-        self.blind_ns = max(refractory_ns, 1)
         usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
         usable[index.hot_pixels] = False
         self._pixels = usable.nonzero()[:, 0]
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> EventPairs:
-        """Draws `batch_size` silent pairs (on = off = 0); the generator lives on the device of the index.
+    def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
+        """Draws `batch_size` silent pairs (on = off = 0).
 
         Where silent intervals are so rare that `ROUNDS` rounds find fewer, those found are used again, with other
         instants; where they find none, the batch is empty.
+
+        Args:
+            batch_size: Pairs.
+            generator: On the device of the index.
+            refractory_ns: For how long a pixel is blind after an event.
         """
         found = []
         for _ in range(self.ROUNDS):
-            found.append(self._silent_intervals(max(2 * batch_size, 1024), generator))
+            found.append(self._silent_intervals(max(2 * batch_size, 1024), generator, max(refractory_ns, 1)))
             if sum(len(pixels) for pixels, _, _ in found) >= batch_size:
                 break
         pixels, begin, end = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -207,10 +185,11 @@ class SilentPixelSampler:
         one = _randint(instants, generator)
         other = _randint(instants - 1, generator)
         other += other >= one
+        start, end = begin + torch.minimum(one, other), begin + torch.maximum(one, other)
         none = torch.zeros_like(pixels)
-        return EventPairs(pixels, begin + torch.minimum(one, other), begin + torch.maximum(one, other), none, none)
+        return EventBatch(pixels, start, end, none, none, torch.ones_like(pixels, dtype=torch.bool))
 
-    def _silent_intervals(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    def _silent_intervals(self, draws: int, generator: torch.Generator, blind_ns: int) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""
         times, offsets = self.index.times, self.index.offsets
         chosen = torch.randint(len(self._pixels), (draws,), generator=generator, device=times.device)
@@ -220,7 +199,7 @@ class SilentPixelSampler:
         following = first + self.index.count_until(pixels, instant)
         previous_time = times[(following - 1).clamp(min=0)]
         following_time = times[following.clamp(max=len(times) - 1)]
-        begin = torch.where(following > first, previous_time + self.blind_ns, self.start_ns).clamp(min=self.start_ns)
+        begin = torch.where(following > first, previous_time + blind_ns, self.start_ns).clamp(min=self.start_ns)
         end = torch.where(following < stop, following_time - 1, self.end_ns).clamp(max=self.end_ns)
         usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)

@@ -24,7 +24,7 @@ from enerf_ns.dataparsers.formats import eds, tum_vie
 from enerf_ns.dataparsers.formats.event_recording import read_cameras
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.sensor.response import colour_channels, luma, pixel_brightness
+from enerf_ns.sensor.response import ColourFilter, luma, pixel_brightness
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
 from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
@@ -495,7 +495,10 @@ class Simulate:
 DEFAULTS = {setting.name: setting.default for setting in fields(Simulate)}
 
 
-_filters = cache(colour_channels)
+@cache
+def _filters(pattern: str, width: int, height: int) -> torch.Tensor:
+    """Colour channel that each pixel sees."""
+    return ColourFilter(pattern, width).channels(torch.arange(width * height))
 
 
 def _centred(width: int, height: int, field_of_view: float) -> Camera:

@@ -129,21 +129,30 @@ def luma(rgb: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch"]:
     return rgb @ rgb.new_tensor(LUMA)
 
 
-def colour_channels(pattern: str, width: int, height: int) -> Int64[Tensor, " pixels"]:
-    """Colour channel, 0, 1 or 2, that each pixel of a sensor with a colour filter sees, by pixel number.
+class ColourFilter:
+    """The colour filter before a sensor's pixels.
 
     Args:
         pattern: Letters R, G and B of the pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; the filter
             repeats them.
-        width, height: Of the sensor, pixels.
+        width: Of the sensor, pixels.
 
     Raises:
         ValueError: The pattern is not four of these letters.
     """
-    if len(pattern) != 4 or not set(pattern) <= set("RGB"):
-        raise ValueError(f"A colour filter is four letters of R, G and B, such as RGGB, not {pattern!r}.")
-    tile = torch.tensor(["RGB".index(letter) for letter in pattern]).reshape(2, 2)
-    return tile.repeat(-(-height // 2), -(-width // 2))[:height, :width].flatten()
+
+    def __init__(self, pattern: str, width: int):
+        if len(pattern) != 4 or not set(pattern) <= set("RGB"):
+            raise ValueError(
+                f"a colour filter {pattern!r}, but four letters of R, G and B, such as RGGB, were expected."
+            )
+        self.width = width
+        self._tile = torch.tensor(["RGB".index(letter) for letter in pattern])
+
+    def channels(self, pixels: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
+        """Colour channel, 0, 1 or 2, that each of some pixels (y * width + x) sees."""
+        x, y = pixels % self.width, pixels // self.width
+        return self._tile.to(pixels.device)[2 * (y % 2) + x % 2]
 
 
 def pixel_brightness(

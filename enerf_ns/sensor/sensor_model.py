@@ -1,15 +1,42 @@
-"""The sensor between rendered brightness and events: response, contrast thresholds, refractory period, colour filter."""
+"""The sensor between brightness and events: response, contrast thresholds, refractory period, colour filter."""
 
 from __future__ import annotations
 
-import torch
-from jaxtyping import Float, Int, Int64
+from dataclasses import dataclass, field
+from typing import Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import tyro
+from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor, nn
 
-from enerf_ns.sensor.response import Linlog, Response, pixel_brightness
+from enerf_ns.sensor.response import ColourFilter, pixel_brightness, response_named
 
 DEFAULT_CONTRAST_THRESHOLD = 0.25
 """Mean threshold assumed where a recording does not state one. Events fix brightness only up to this factor."""
+
+GREY = "grey"
+"""In place of a Bayer pattern: a sensor without a colour filter."""
+
+
+@dataclass
+class SensorModelConfig:
+    """The sensor. What is None is chosen from the recording."""
+
+    _target: Type[SensorModel] = field(default_factory=lambda: SensorModel)  # noqa: UP006
+    contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
+    """C_on and C_off. None: the recording's own, else from the counts of both polarities."""
+    response: Optional[str] = None  # noqa: UP045
+    """What a pixel makes of brightness: linlog, or logarithm:OFFSET. None: the recording's own, else linlog."""
+    refractory_period_ns: Optional[int] = None  # noqa: UP045
+    """For how long a pixel is blind after an event. None: the recording's own."""
+    bayer_pattern: Optional[str] = None  # noqa: UP045
+    """Colours of the pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; grey: none. None: the recording's own."""
+    width: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
+    """Of the sensor, pixels."""
+
+    def setup(self) -> SensorModel:
+        """The sensor of this config, whose class is `_target`."""
+        return self._target(self)
 
 
 class SensorModel(nn.Module):
@@ -17,31 +44,27 @@ class SensorModel(nn.Module):
 
     A pixel compares log brightness at two instants, fires one event per contrast threshold crossed, and is then blind
     for the refractory period. Here all of this are fixed numbers. A subclass that learns one of them holds it as a
-    parameter and overrides what uses it; nothing else needs to change, since a model trains the parameters that its
-    sensor has, and nobody asks for the numbers themselves.
+    parameter and overrides what uses it; nothing else changes, since everybody asks these methods and not for the
+    numbers, and whatever parameters there are get trained and stored.
 
     Args:
-        contrast_thresholds: (C_on, C_off), both positive, in units of log brightness.
-        response: What a pixel makes of brightness.
-        refractory_period: For how long a pixel is blind after an event, ns; 0 for not at all.
-        channels: Colour channel 0, 1 or 2 that each pixel sees, by pixel number (`response.colour_channels`); None for
-            a grey sensor.
+        config: With nothing left open.
+
+    Raises:
+        ValueError: A response or colour filter that there is not.
     """
 
-    channels: Tensor | None
-
-    def __init__(
-        self,
-        contrast_thresholds: tuple[float, float],
-        response: Response | None = None,
-        refractory_period: int = 0,
-        channels: Int64[Tensor, " pixels"] | None = None,
-    ):
+    def __init__(self, config: SensorModelConfig):
         super().__init__()
-        self.contrast_thresholds = contrast_thresholds
-        self.response = response or Linlog()
-        self.refractory_period = refractory_period
-        self.register_buffer("channels", channels, persistent=False)
+        assert config.contrast_thresholds is not None and config.response is not None
+        assert config.refractory_period_ns is not None and config.bayer_pattern is not None
+        self.contrast_thresholds = config.contrast_thresholds
+        self.response = response_named(config.response)
+        self.refractory_period = config.refractory_period_ns
+        self.colour_filter = None
+        if config.bayer_pattern != GREY:
+            assert config.width is not None
+            self.colour_filter = ColourFilter(config.bayer_pattern, config.width)
 
     def log_brightness(
         self, rgb: Float[Tensor, "*batch channels"], pixels: Int64[Tensor, "*batch"]
@@ -52,7 +75,8 @@ class SensorModel(nn.Module):
             rgb: Linear brightness.
             pixels: Their numbers, y * width + x.
         """
-        return self.response(pixel_brightness(rgb, None if self.channels is None else self.channels[pixels]))
+        channel = None if self.colour_filter is None else self.colour_filter.channels(pixels)
+        return self.response(pixel_brightness(rgb, channel))
 
     def measured_change(
         self, on: Int[Tensor, "*batch"], off: Int[Tensor, "*batch"], pixels: Int64[Tensor, "*batch"]
@@ -66,22 +90,26 @@ class SensorModel(nn.Module):
         """
         return self.contrast_thresholds[0] * on - self.contrast_thresholds[1] * off
 
-    def interval_start(self, first: Int64[Tensor, "*batch"], end: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
-        """When a pixel that fired can see again, and with it the interval that its next events measure begins (ns).
-
-        After an event a pixel is blind for the refractory period, and then compares brightness with what it sees first
-        (Robust e-NeRF, Low and Lee, ICCV 2023). The interval is at least 1 ns long.
-
-        Args:
-            first: Time of the event before the interval, ns.
-            end: Time of the last event of the interval, ns.
-        """
-        return torch.minimum(first + self.refractory_period, end - 1)
-
     @property
     def mean_threshold(self) -> float | Float[Tensor, ""]:
         """The unit in which losses count changes of log brightness."""
-        return 0.5 * sum(self.contrast_thresholds)
+        return 0.5 * (self.contrast_thresholds[0] + self.contrast_thresholds[1])
+
+    def blind_after(
+        self, event: Int64[Tensor, "*batch"], until: Int64[Tensor, "*batch"]
+    ) -> Float64[Tensor, "*batch"] | None:
+        """For how long (ns) a pixel is blind after an event; None where it never is.
+
+        Afterwards it compares brightness with what it sees first (Robust e-NeRF, Low and Lee, ICCV 2023), so that the
+        interval that its next events measure begins then. It lasts at least 1 ns.
+
+        Args:
+            event: Time of the event before the interval, ns.
+            until: Time of the last event of the interval, ns.
+        """
+        if not self.refractory_period:
+            return None
+        return (until - 1 - event).clamp(max=self.refractory_period).double()
 
 
 def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
@@ -95,8 +123,3 @@ def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
         return DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD
     on = 2.0 * DEFAULT_CONTRAST_THRESHOLD * num_off / (num_on + num_off)
     return on, 2.0 * DEFAULT_CONTRAST_THRESHOLD - on
-
-
-def measured_change(on: Tensor, off: Tensor, thresholds: tuple[float, float]) -> Tensor:
-    """For what does not have a sensor yet."""
-    return thresholds[0] * on - thresholds[1] * off

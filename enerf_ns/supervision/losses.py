@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from enerf_ns.sensor.response import luma
 
-def event_loss(
-    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
+
+def squared_event_loss(
+    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float | Tensor
 ) -> Float[Tensor, ""]:
     """Mean squared error of the change of log brightness, in units of the contrast threshold.
 
@@ -24,9 +26,9 @@ def event_loss(
 
 
 def huber_event_loss(
-    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
+    predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float | Tensor
 ) -> Float[Tensor, ""]:
-    """As `event_loss`, but linear beyond one threshold, so that pairs with wrong or missing events count less.
+    """As `squared_event_loss`, but linear beyond one threshold, so that pairs with wrong or missing events count less.
 
     Twice the Huber loss with delta 1 of the error in units of the mean threshold (the loss of Deblur e-NeRF, Low and
     Lee, ECCV 2024): equal to the squared error below one threshold.
@@ -47,7 +49,7 @@ def normalised_event_loss(
 
 
 def no_event_loss(
-    predicted: Float[Tensor, " pairs"], thresholds: tuple[float, float], margin: float = 1.0
+    predicted: Float[Tensor, " pairs"], thresholds: tuple[float | Tensor, float | Tensor], margin: float = 1.0
 ) -> Float[Tensor, ""]:
     """Mean of how far a silent pixel's rendered change goes beyond what it may without an event.
 
@@ -65,6 +67,14 @@ def no_event_loss(
     return torch.mean(excess) / (0.5 * (on + off))
 
 
-def frame_loss(predicted: Float[Tensor, "rays channels"], target: Float[Tensor, "rays channels"]) -> Float[Tensor, ""]:
-    """Mean squared error between rendered and recorded pixels, both in [0, 1]."""
-    return torch.mean((predicted - target) ** 2)
+def frame_loss(rendered: Float[Tensor, "rays 3"], recorded: Float[Tensor, "rays 3"], grey: bool) -> Float[Tensor, ""]:
+    """Mean squared error between rendered and recorded pixels, both in [0, 1].
+
+    Args:
+        rendered: What the field shows.
+        recorded: What the frames show.
+        grey: Compare brightness alone (luma), as where the field is grey; frames that are grey are always compared so.
+    """
+    if grey or (recorded == recorded[..., :1]).all():
+        rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
+    return torch.mean((rendered - recorded) ** 2)

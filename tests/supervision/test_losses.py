@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from enerf_ns.supervision.losses import event_loss, frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
+from enerf_ns.supervision.losses import frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
 
 PREDICTED = torch.tensor([0.5, -0.25, 0.0])
 MEASURED = torch.tensor([0.25, -0.5, 0.5])

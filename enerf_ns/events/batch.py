@@ -1,0 +1,64 @@
+"""What one training step looks at: pairs of instants of pixels of the event camera, and pixels of frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class EventBatch:
+    """Pixels, each with two instants and the events that it fired between them, the second instant included."""
+
+    pixels: Int64[Tensor, " pairs"]
+    """Numbers of the pixels, y * width + x."""
+    start: Int64[Tensor, " pairs"]
+    """First instant, ns; of a pair of events, that of its first event."""
+    end: Int64[Tensor, " pairs"]
+    """Second instant, ns; later than the first."""
+    on: Int64[Tensor, " pairs"]
+    """Number of positive events."""
+    off: Int64[Tensor, " pairs"]
+    """Number of negative events."""
+    silent: Bool[Tensor, " pairs"]
+    """Whether the pair is of a silent pixel, whose instants are any between two of its events."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @staticmethod
+    def joined(batches: list[EventBatch]) -> EventBatch:
+        """One batch of several, in their order."""
+        names = ("pixels", "start", "end", "on", "off", "silent")
+        return EventBatch(*(torch.cat([getattr(batch, name) for batch in batches]) for name in names))
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Pixels of frames."""
+
+    indices: Int64[Tensor, "rays 3"]
+    """Frame, row and column of each."""
+    colours: Float[Tensor, "rays 3"]
+    """What was recorded there, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class TrainBatch:
+    """Of events, of frames, or of both. Its rays are rendered in one go: all starts, all ends, all pixels of frames."""
+
+    events: EventBatch | None
+    frames: FrameBatch | None
+
+    @property
+    def num_pairs(self) -> int:
+        """Pairs of instants, of events and of silent pixels."""
+        return 0 if self.events is None else len(self.events)
+
+    def split(self, rendered: Float[Tensor, "rays channels"]) -> tuple[Tensor, Tensor, Tensor]:
+        """What was rendered at the first instants (pairs, channels), at the second ones, and of the frames."""
+        pairs = self.num_pairs
+        return rendered[:pairs], rendered[pairs : 2 * pairs], rendered[2 * pairs :]

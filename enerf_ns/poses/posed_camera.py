@@ -1,0 +1,80 @@
+"""From pixels and times to rays, in the axes and the unit of the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int64
+from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+
+class PosedCamera:
+    """A camera that moves along a trajectory. Every pixel looks from where the camera is at a time of its own.
+
+    Args:
+        camera: With its distortion.
+        trajectory: Of this camera.
+        transform: [R | t] of the scene, shape (3, 4): a point p of the recording's world lies at scale * (R p + t).
+        scale: Scene units per metre.
+        device: Of the rays.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        trajectory: Trajectory,
+        transform: Float[Tensor, "3 4"],
+        scale: float,
+        device: torch.device | str = "cpu",
+    ):
+        self.camera, self.trajectory, self.scale = camera, trajectory, scale
+        self._transform = transform.double().to(device)
+        directions = camera.pixel_directions().reshape(-1, 3)
+        norms = np.linalg.norm(directions, axis=-1, keepdims=True)
+        self._directions = torch.from_numpy(directions / norms).float().to(device)
+        self._norms = torch.from_numpy(norms).float().to(device)
+
+    def rays(
+        self,
+        pixels: Int64[Tensor, " rays"],
+        times: Int64[Tensor, " rays"],
+        delays: Float64[Tensor, " rays"] | None = None,
+        corrections: Float[Tensor, "rays 6"] | None = None,
+    ) -> RayBundle:
+        """Rays through the centres of pixels, differentiable in `delays` and `corrections`.
+
+        Args:
+            pixels: Their numbers, y * width + x.
+            times: ns, within the trajectory.
+            delays: ns that are added to the times, of any sign; with them a time can be learned. None: none.
+            corrections: Of the poses, in the axes of the camera: a shift in metres, then a rotation vector in radians;
+                with them poses can be refined. None: none.
+
+        Returns:
+            origins (rays, 3) in scene units; directions (rays, 3) of length 1; pixel_area (rays, 1); metadata
+            directions_norm (rays, 1), the length along a ray of one unit along the optical axis.
+
+        Raises:
+            ValueError: A time outside the trajectory.
+        """
+        poses = self.trajectory.poses(times, delays)
+        rotation, position = poses[..., :3], poses[..., 3]
+        if corrections is not None:
+            correction = exp_map_SO3xR3(corrections.double())
+            position = position + (rotation @ correction[..., 3:])[..., 0]
+            rotation = rotation @ correction[..., :3]
+        rotation = self._transform[:, :3] @ rotation
+        origins = self.scale * (position @ self._transform[:, :3].T + self._transform[:, 3])
+        directions = torch.einsum("nij,nj->ni", rotation.float(), self._directions[pixels])
+        area = 1.0 / (self.camera.fx * self.camera.fy)
+        return RayBundle(
+            origins=origins.float(),
+            directions=directions,
+            pixel_area=torch.full_like(origins[:, :1], area, dtype=torch.float32),
+            metadata={"directions_norm": self._norms[pixels]},
+        )

@@ -1,0 +1,93 @@
+"""What a rendered field is told by events, whatever rendered it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from enerf_ns.events.batch import EventBatch
+from enerf_ns.sensor.sensor_model import SensorModel
+from enerf_ns.supervision.losses import (
+    huber_event_loss,
+    no_event_loss,
+    normalised_event_loss,
+    squared_event_loss,
+)
+
+EventLoss = Callable[[Tensor, Tensor, "float | Tensor"], Tensor]
+"""Rendered changes of log brightness (pairs,), measured ones (pairs,), mean contrast threshold; gives one number."""
+
+EVENT_LOSSES: dict[str, EventLoss] = {
+    "huber": huber_event_loss,
+    "squared": squared_event_loss,
+    "normalised": lambda predicted, measured, _: normalised_event_loss(predicted, measured),
+}
+"""By the names that the flag event-loss takes; a loss of one's own is put in here."""
+
+
+@dataclass(frozen=True)
+class EventSupervision:
+    """Losses and metrics of the pairs of a batch; of a field, splats, or anything else that renders brightness."""
+
+    event_loss: str
+    """A name of `EVENT_LOSSES`."""
+    event_loss_weight: float
+    no_event_loss_weight: float
+    """Of the loss on silent pixels."""
+    no_event_margin: float
+    """Share of the threshold that a silent pixel may change at no cost."""
+
+    def losses(
+        self,
+        start: Float[Tensor, "pairs channels"],
+        end: Float[Tensor, "pairs channels"],
+        batch: EventBatch,
+        sensor: SensorModel,
+    ) -> dict[str, Tensor]:
+        """event_loss, where the batch has events, and no_event_loss, where it has silent pixels; with their weights.
+
+        Args:
+            start: Brightness rendered at the first instants.
+            end: Brightness rendered at the second instants.
+            batch: What was measured.
+            sensor: What measured it.
+        """
+        change = brightness_change(start, end, batch, sensor)
+        fired = ~batch.silent
+        losses: dict[str, Tensor] = {}
+        measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
+        if len(measured):
+            loss = EVENT_LOSSES[self.event_loss](change[fired], measured, sensor.mean_threshold)
+            losses["event_loss"] = self.event_loss_weight * loss
+        if len(measured) < len(batch):
+            loss = no_event_loss(change[batch.silent], sensor.contrast_thresholds, self.no_event_margin)
+            losses["no_event_loss"] = self.no_event_loss_weight * loss
+        return losses
+
+    @torch.no_grad()
+    def metrics(
+        self,
+        start: Float[Tensor, "pairs channels"],
+        end: Float[Tensor, "pairs channels"],
+        batch: EventBatch,
+        sensor: SensorModel,
+    ) -> dict[str, Tensor]:
+        """event_correlation: the linear correlation of rendered and measured changes; arguments as of `losses`."""
+        fired = ~batch.silent
+        change = brightness_change(start, end, batch, sensor)[fired]
+        measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
+        return {"event_correlation": torch.corrcoef(torch.stack([change, measured]))[0, 1]}
+
+
+def brightness_change(
+    start: Float[Tensor, "pairs channels"],
+    end: Float[Tensor, "pairs channels"],
+    batch: EventBatch,
+    sensor: SensorModel,
+) -> Float[Tensor, " pairs"]:
+    """Change of log brightness, as the pixels of a batch see what was rendered at their two instants."""
+    return sensor.log_brightness(end, batch.pixels) - sensor.log_brightness(start, batch.pixels)
