@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from platformdirs import user_cache_path
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
-from enerf_ns.user_cache import user_cache_folder
 
 LAYOUT = 2
 """Counted up when what is stored changes."""
@@ -42,7 +42,7 @@ def cache_folder() -> Path:
     """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder."""
     if "ENERF_CACHE" in os.environ:
         return Path(os.environ["ENERF_CACHE"]).expanduser()
-    return user_cache_folder() / "indices"
+    return user_cache_path("enerf-ns", appauthor=False) / "indices"
 
 
 def entry_name(**made_from: object) -> str:

@@ -19,7 +19,6 @@ from tyro.conf import Fixed, Suppress
 from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
 from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import exit_with_a_sentence
-from enerf_ns.dataparsers.event_dataparser import EventDataParser
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.lpips import lpips
@@ -51,7 +50,7 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
         with exit_with_a_sentence():
             resolution = self.resolution
             if not resolution.choices:
-                resolution = resolve(self, EventDataParser(self.datamanager.dataparser).recording())
+                resolution = resolve(self, self.datamanager.dataparser.setup().recording())
             return self._target(resolution.applied_to(self), **kwargs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:

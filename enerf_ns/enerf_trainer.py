@@ -16,7 +16,7 @@ from rich.table import Table
 
 from enerf_ns.choices import Choice, resolve
 from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
-from enerf_ns.dataparsers.event_dataparser import EventDataParser, scene_normalisation
+from enerf_ns.dataparsers.event_dataparser import scene_normalisation
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
@@ -53,14 +53,14 @@ class EnerfTrainerConfig(TrainerConfig):
         for group in config.optimizers.values():
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         if not pipeline.resolution.choices:
-            recording = EventDataParser(parser).recording()
+            recording = parser.setup().recording()
             pipeline.resolution = resolve(pipeline, recording, self.preset)
         index_events(config.recording())
         return config
 
     def recording(self) -> EventRecording:
         """What is learnt from, of a config that is resolved."""
-        return EventDataParser(self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser).recording()
+        return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
 
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""

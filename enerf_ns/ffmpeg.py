@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from enerf_ns.user_cache import user_cache_folder
+from platformdirs import user_cache_path
 
 
 def make_ffmpeg_available() -> None:
@@ -20,7 +20,7 @@ def make_ffmpeg_available() -> None:
     if shutil.which("ffmpeg") is not None:
         return
     try:
-        folder = user_cache_folder() / "bin"
+        folder = user_cache_path("enerf-ns", appauthor=False) / "bin"
         if shutil.which("ffmpeg", path=str(folder)) is None:
             _link_ffmpeg_into(folder)
     except (ImportError, OSError, RuntimeError):  # RuntimeError: no home folder, or no binary for this platform

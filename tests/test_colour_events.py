@@ -14,9 +14,9 @@ from nerfstudio.scripts.train import _set_random_seed
 from PIL import Image
 from recordings import joined
 
-from enerf_ns.choices import fill_in_choices
+from enerf_ns.choices import resolve
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
@@ -24,8 +24,10 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.evaluation.metrics import align_channels
+from enerf_ns.events.batch import TrainBatch
 from enerf_ns.sensor.response import inverse_linlog, linlog
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
+from enerf_ns.supervision.event_supervision import brightness_change
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 32.0
 PATTERN = "GRBG"
@@ -121,24 +123,28 @@ def small_config(recording: EventRecording, supervision: Any = "events") -> Ener
 
 def make_pipeline(recording: EventRecording) -> Any:
     _set_random_seed(0)
-    config = small_config(recording)
-    fill_in_choices(config, recording)
-    pipeline = config.setup(device="cpu")
+    pipeline = small_config(recording).setup(device="cpu")
     pipeline.train()
     return pipeline
 
 
-def test_a_step_says_which_channel_every_pair_sees(recording: EventRecording):
+def batch_and_rays(pipeline: Any) -> tuple[TrainBatch, Any]:
+    manager, sensor = pipeline.datamanager, pipeline.model.sensor
+    batch = manager.next_batch(sensor)
+    return batch, manager.rays(batch, sensor)
+
+
+def test_the_sensor_says_which_channel_every_pair_sees(recording: EventRecording):
     """From the directions of its rays, projected into the sensor."""
-    manager = make_pipeline(recording).datamanager
-    rays, batch = manager.next_train(0)
-    turn = manager.train_dataparser_outputs.dataparser_transform[:, :3]
-    assert batch["num_pairs"] == len(batch["channel"]) == 256 + 32
+    pipeline = make_pipeline(recording)
+    batch, rays = batch_and_rays(pipeline)
+    turn = pipeline.datamanager.train_dataparser_outputs.dataparser_transform[:, :3]
+    assert batch.events is not None and batch.num_pairs == 256 + 32
     x, y, z = (rays.directions @ turn).T
     column = (FOCAL * x / z + (WIDTH - 1) / 2).round().int().tolist()
     row = (FOCAL * y / z + (HEIGHT - 1) / 2).round().int().tolist()
     letters = [PATTERN[2 * (v % 2) + u % 2] for u, v in zip(column, row, strict=True)]
-    channels = [int(channel) for channel in batch["channel"].repeat(2)]
+    channels = pipeline.model.sensor.colour_filter.channels(batch.events.pixels.repeat(2)).tolist()
     assert set(channels) == {0, 1, 2}
     assert letters == ["RGB"[channel] for channel in channels]
 
@@ -147,12 +153,13 @@ def test_a_step_says_which_channel_every_pair_sees(recording: EventRecording):
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, channel: int, loss: str):
     pipeline = make_pipeline(recording)
-    pipeline.model.config.event_loss = loss
+    pipeline.model.supervision = replace(pipeline.model.supervision, event_loss=loss)
     torch.nn.init.normal_(pipeline.model.field.geometry.grid.table)
-    rays, batch = pipeline.datamanager.next_train(0)
-    events = len(batch["on"])
-    batch["channel"] = torch.full_like(batch["channel"], channel)
-    batch["channel"][events:] = (channel + 1) % 3
+    batch, rays = batch_and_rays(pipeline)
+    assert batch.events is not None
+    seen = torch.where(batch.events.silent, (channel + 1) % 3, channel)
+    pixels = torch.tensor([PATTERN.index(letter) for letter in "RGB"])[seen]  # of the first row and the second
+    batch = replace(batch, events=replace(batch.events, pixels=pixels % 2 + WIDTH * (pixels // 2)))
     outputs = pipeline.model(rays)
     losses = pipeline.model.get_loss_dict(outputs, batch)
     weight = pipeline.model.field.color_network.layers[-1].weight
@@ -164,17 +171,21 @@ def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, chann
 def test_the_change_of_a_pair_is_that_of_its_channel(recording: EventRecording):
     """With the wall's true brightness as a render, the pairs change as their events say."""
     pipeline = make_pipeline(recording)
-    manager, model = pipeline.datamanager, pipeline.model
-    rays, batch = manager.next_train(0)
+    manager = pipeline.datamanager
+    batch, rays = batch_and_rays(pipeline)
+    assert batch.events is not None
     outputs = manager.train_dataparser_outputs
     turn, scale = outputs.dataparser_transform, outputs.dataparser_scale
     origins = (rays.origins / scale - turn[:, 3]) @ turn[:, :3]
     directions = rays.directions @ turn[:, :3]
     x, y, _ = (origins + directions / directions[:, 2:]).double().numpy().T
     rgb = inverse_linlog(torch.from_numpy(log_brightness(x, y)))
-    predicted, measured, num_events = model.brightness_changes({"rgb": rgb}, batch)
-    np.testing.assert_allclose(predicted[:num_events], measured, atol=1e-3)
-    assert predicted[num_events:].abs().max() < 2 * max(THRESHOLDS)
+    start, end, _ = batch.split(rgb)
+    events, sensor = batch.events, pipeline.model.sensor
+    predicted = brightness_change(start, end, events, sensor)
+    measured = sensor.measured_change(events.on, events.off, events.pixels)
+    np.testing.assert_allclose(predicted[~events.silent], measured[~events.silent], atol=1e-3)
+    assert predicted[events.silent].abs().max() < 2 * max(THRESHOLDS)
 
 
 def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(recording: EventRecording):
@@ -218,7 +229,7 @@ def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
     grey = replace(recording, bayer_pattern=None)
     pipeline = make_pipeline(grey)
     assert pipeline.model.config.num_channels == 1
-    assert "channel" not in pipeline.datamanager.next_train(0)[1]
+    assert pipeline.model.sensor.colour_filter is None
     _, summary = pipeline.held_out_views()
     assert {"brightness_scale", "brightness_offset"} <= set(summary)
 
@@ -226,32 +237,42 @@ def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
 @pytest.mark.parametrize("supervision", ["events", "events+frames"])
 def test_a_colour_filter_needs_three_channels_and_the_table_says_so(recording: EventRecording, supervision: str):
     config = small_config(recording, supervision)
-    colour = next(choice for choice in fill_in_choices(config, recording) if choice.part == "colour")
-    assert config.model.num_channels == 3
+    resolution = resolve(config, recording)
+    colour = next(choice for choice in resolution.choices if choice.part == "colour")
+    assert resolution.values["model.num_channels"] == 3
     assert colour.kept and colour.why == "the sensor has a colour filter (GRBG)"
 
 
 def test_one_channel_behind_a_colour_filter_is_refused(recording: EventRecording):
     config = small_config(recording)
     config.model.num_channels = 1
-    with pytest.raises(RecordingError, match=r"colour filter \(GRBG\).*--pipeline\.model\.num-channels is 1") as error:
-        fill_in_choices(config, recording)
+    with pytest.raises(FlagError, match=r"colour filter \(GRBG\).*--pipeline\.model\.num-channels is 1") as error:
+        resolve(config, recording)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("mode", "approximate"), [("successor", False), ("partner", True), ("window", True)])
-def test_the_refractory_period_reaches_the_sampler_and_the_table(recording: EventRecording, mode, approximate: bool):
+def test_the_refractory_period_reaches_the_rays_and_the_table(recording: EventRecording, mode, approximate: bool):
     blind = replace(recording, refractory_period=8_000_000)
     config = small_config(blind)
     config.datamanager.pair_mode = mode
-    choices = fill_in_choices(config, blind)
-    why = next(choice.why for choice in choices if choice.part == "event loss")
+    why = next(choice.why for choice in resolve(config, blind).choices if choice.part == "event loss")
     assert "8 ms" in why and ("successor" in why) == approximate
-    manager = config.setup(device="cpu").datamanager
-    pairs = manager.pair_sampler.sample(1000, torch.Generator().manual_seed(0))
-    after_event = torch.isin(pairs.start - 8_000_000, index_events(recording).times)
-    assert (after_event | (pairs.start == pairs.end - 1)).all() and after_event.any()
-    silent = manager.silent_sampler.sample(1000, torch.Generator().manual_seed(0))
-    before = index_events(recording).count_until(silent.pixels, silent.start)
-    latest = index_events(recording).times[index_events(recording).offsets[silent.pixels] + before - 1]
-    assert (silent.start - latest >= 8_000_000)[before > 0].all()
+    pipeline = config.setup(device="cpu")
+    batch, sensor, index = (
+        pipeline.datamanager.next_batch(pipeline.model.sensor),
+        pipeline.model.sensor,
+        index_events(blind),
+    )
+    events = batch.events
+    assert torch.isin(events.start[~events.silent], index.times).all()
+    blind_for = sensor.blind_after(events.start, events.end)
+    assert ((blind_for == 8_000_000) | (events.start + blind_for == events.end - 1)).all()
+    rays = pipeline.datamanager.event_rays(events, sensor)
+    later = events.start + torch.where(events.silent, 0, blind_for.long())
+    expected = pipeline.datamanager.event_camera.rays(events.pixels.repeat(2), torch.cat([later, events.end]))
+    torch.testing.assert_close(rays.origins, expected.origins, rtol=0, atol=1e-7)
+    silent_pixels, silent_start = events.pixels[events.silent], events.start[events.silent]
+    before = index.count_until(silent_pixels, silent_start)
+    latest = index.times[index.offsets[silent_pixels] + before - 1]
+    assert (silent_start - latest >= 8_000_000)[before > 0].all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -23,6 +24,7 @@ from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.sensor.response import luma
+from enerf_ns.supervision.event_supervision import EVENT_LOSSES, brightness_change
 
 WIDTH, HEIGHT = 32, 24
 
@@ -59,7 +61,7 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
     model.opacity_loss_weight, model.distortion_loss_weight = 0.0, 0.01
     model.log2_table_size, model.num_levels = 12, 4
     model.num_samples = model.num_proposal_samples = 16
-    parts = {"data": manager, "model": model}
+    parts = {"data": manager, "model": model, "sensor": model.sensor}
     for name, value in changes.items():
         part, field = name.split("__")
         assert hasattr(parts[part], field)
@@ -108,6 +110,7 @@ CHOICES = [
     if get_origin(hint) is Literal and name in config.__annotations__
     for value in get_args(hint)
 ]
+CHOICES += [("model__event_loss", name) for name in EVENT_LOSSES]
 """Every value of every choice that the method has of its own."""
 
 
@@ -152,7 +155,7 @@ def test_two_steps_of_every_method_as_it_is_registered(recording: Path, tmp_path
     """Only batch and field are made smaller."""
     registered = method.config.pipeline
     losses = {
-        "data__silent_pairs": min(registered.datamanager.silent_pairs, 32),
+        "data__silent_pairs": min(registered.defaults.silent_pairs, 32),
         "model__opacity_loss_weight": registered.model.opacity_loss_weight,
         "model__distortion_loss_weight": registered.model.distortion_loss_weight,
     }
@@ -174,22 +177,21 @@ def test_two_steps_with_frames_in_colour_and_grey_events(colour_recording: Path,
     trainer = check_two_steps(small_config(colour_recording, tmp_path, data__supervision=supervision), losses)
     model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
     assert model.config.num_channels == 3
-    rays, batch = manager.next_train(0)
-    outputs = model(rays)
-    rgb = outputs["rgb"]
+    batch = manager.next_batch(model.sensor)
+    rgb = model(manager.rays(batch, model.sensor))["rgb"]
     assert (rgb.std(dim=-1) > 0).any(), "the field is in colour"
     if "events" in supervision:
-        predicted, _, _ = model.brightness_changes(outputs, batch)
-        grey = torch.stack([luma(rgb), luma(rgb), luma(rgb)], dim=-1)
-        torch.testing.assert_close(model.brightness_changes({"rgb": grey}, batch)[0], predicted)
+        start, end, _ = batch.split(rgb)
+        predicted = brightness_change(start, end, batch.events, model.sensor)
+        grey = [luma(shown)[:, None].expand(-1, 3) for shown in (start, end)]
+        torch.testing.assert_close(brightness_change(*grey, batch.events, model.sensor), predicted)
 
 
 @pytest.mark.parametrize("supervision", ["events", "events+frames"])
 def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colour_recording, tmp_path, supervision):
     data = colour_recording if supervision == "events" else recording
-    config = small_config(data, tmp_path, data__supervision=supervision)
-    config.prepare()
-    assert config.pipeline.model.num_channels == 1
+    config = small_config(data, tmp_path, data__supervision=supervision).resolved()
+    assert config.pipeline.resolution.values["model.num_channels"] == 1
 
 
 def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: Path):
@@ -201,22 +203,27 @@ def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: P
         data__silent_pairs=10,
         data__train_num_rays_per_batch=20,
     )
-    manager = set_up(config).pipeline.datamanager
-    rays, batch = manager.next_train(0)
-    assert batch["num_pairs"] == rays.num_pairs == 64 + 10
-    assert len(rays) == 2 * 74 + 20
-    assert len(batch["on"]) == len(batch["off"]) == 64 and (batch["on"] + batch["off"] > 0).all()
-    assert len(batch["image"]) == 20
+    pipeline = set_up(config).pipeline
+    manager = pipeline.datamanager
+    batch = manager.next_batch(pipeline.model.sensor)
+    rays = manager.rays(batch, pipeline.model.sensor)
+    assert batch.num_pairs == rays.num_pairs == 64 + 10
+    assert len(rays) == manager.get_train_rays_per_batch() == 2 * 74 + 20
+    events, frames = batch.events, batch.frames
+    assert (~events.silent).sum() == 64 and ((events.on + events.off > 0) == ~events.silent).all()
+    assert len(frames.colours) == 20
+    parts = batch.split(torch.arange(len(rays))[:, None])
+    assert [len(part) for part in parts] == [74, 74, 20] and torch.cat(parts).flatten().tolist() == [*range(168)]
 
     files = manager.train_dataset.frames.filenames
     assert all(file.parent.name == "images_corrupted" for file in files)
-    for color, (frame, row, column) in zip(batch["image"], batch["indices"].tolist(), strict=True):
-        np.testing.assert_allclose(color, load_image(files[frame])[row, column] / 255.0, atol=1e-6)
-    frame, row, column = batch["indices"].T
+    for colour, (frame, row, column) in zip(frames.colours, frames.indices.tolist(), strict=True):
+        np.testing.assert_allclose(colour, load_image(files[frame])[row, column] / 255.0, atol=1e-6)
+    frame, row, column = frames.indices.T
     coordinates = torch.stack([row, column], dim=-1) + 0.5
     expected = manager.train_dataset.cameras.generate_rays(camera_indices=frame[:, None], coords=coordinates)
-    torch.testing.assert_close(rays.origins[-20:], expected.origins)
-    torch.testing.assert_close(rays.directions[-20:], expected.directions)
+    torch.testing.assert_close(rays.origins[-20:], expected.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rays.directions[-20:], expected.directions, rtol=0, atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_losses_and_another_seed_others(recording: Path, tmp_path: Path):
@@ -307,20 +314,22 @@ def test_loading_a_checkpoint_that_does_not_fit_is_an_error(trained: Any, tmp_pa
 
 
 def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, monkeypatch):
-    """Open choices are filled in, paths are absolute; what was stored loads as it was."""
+    """Choices are stored beside what was set, paths are absolute; what was stored loads and prints as it was."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link").symlink_to(recording)
     config = small_config(Path("link"), Path("outputs"))
     config.save_config()
     run = tmp_path / "outputs/recording/enerf/run"
     loaded = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
-    assert loaded == config
-    manager, model = loaded.pipeline.datamanager, loaded.pipeline.model
+    assert loaded == loaded.resolved() == replace(config.resolved(), experiment_name="recording")
+    assert loaded.pipeline.model.num_channels is None and loaded.pipeline.datamanager.dataparser.depth_range is None
+    filled = loaded.pipeline.resolution.applied_to(loaded.pipeline)
+    manager, model = filled.datamanager, filled.model
     for path in (loaded.data, manager.data, manager.dataparser.data):
         assert path == recording.resolve()
     assert loaded.output_dir == tmp_path / "outputs"
     simulated = json.loads((recording / "simulation.json").read_text())
-    assert model.contrast_thresholds == tuple(simulated["contrast_thresholds"])
+    assert model.sensor.contrast_thresholds == tuple(simulated["contrast_thresholds"])
     assert manager.dataparser.depth_range == pytest.approx(simulated["depth_range"])
     assert model.num_channels == 1 and model.max_res > model.base_res and 0 < model.near_plane < 1
     choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
@@ -329,18 +338,26 @@ def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, mon
 
 
 def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
-    forced = {"contrast_thresholds": (0.1, 0.3), "max_res": 99, "near_plane": 0.05, "num_channels": 3}
+    forced = {"max_res": 99, "near_plane": 0.05, "num_channels": 3}
     config = small_config(recording, tmp_path, **{f"model__{name}": value for name, value in forced.items()})
+    config.pipeline.model.sensor.contrast_thresholds = (0.1, 0.3)
     config.pipeline.datamanager.dataparser.depth_range = (1.0, 2.0)
-    config.prepare()
-    assert {name: getattr(config.pipeline.model, name) for name in forced} == forced
-    assert config.pipeline.datamanager.dataparser.depth_range == (1.0, 2.0)
+    resolution = config.resolved().pipeline.resolution
+    filled = resolution.applied_to(config.pipeline)
+    assert {name: getattr(filled.model, name) for name in forced} == forced
+    assert filled.model.sensor.contrast_thresholds == (0.1, 0.3)
+    assert filled.datamanager.dataparser.depth_range == (1.0, 2.0)
+    why = {choice.part: choice.why for choice in resolution.choices}
+    assert {why[part] for part in ("contrast thresholds", "colour", "contraction", "hash grid")} == {"set by flag"}
 
 
 def test_the_registered_method_is_left_as_it_was(recording: Path, tmp_path: Path):
-    small_config(recording, tmp_path).prepare()
-    assert isinstance(enerf.config, EnerfTrainerConfig)
-    assert enerf.config.data is None and enerf.config.pipeline.model.contrast_thresholds is None
+    before = copy.deepcopy(enerf.config)
+    config = small_config(recording, tmp_path)
+    given = copy.deepcopy(config)
+    config.save_config()
+    config.setup()
+    assert config == given and enerf.config == before
 
 
 def test_frames_that_are_not_there_cannot_be_learnt_from(recording: Path, tmp_path: Path):
@@ -366,10 +383,14 @@ def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path
 @pytest.mark.parametrize(
     ("changes", "held_out_every", "message"),
     [
+        ({"model__event_loss": "hubert"}, 4, "--pipeline.model.event-loss is 'hubert', but one of huber, squared"),
+        ({"sensor__response": "log"}, 4, "--pipeline.model.response is the response 'log', but linlog, or"),
+        ({"sensor__bayer_pattern": "RGBW"}, 4, "--pipeline.model.bayer-pattern is a colour filter 'RGBW', but"),
+        ({"sensor__refractory_period_ns": -1}, 4, "--refractory-period-ns is -1"),
         ({}, 0, "--held-out-every 0"),
         ({"data__supervision": "frames"}, 1, "--held-out-every 1 .*11 frames"),
         ({"data__supervision": "events+frames"}, 22, "--held-out-every 22 .*11 frames"),
-        ({"model__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
+        ({"sensor__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
     ],
 )
 def test_flags_that_cannot_be_followed(

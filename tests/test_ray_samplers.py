@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
@@ -8,7 +10,7 @@ from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetwork
 from torch import Tensor
 
 from enerf_ns.enerf_model import BoxCollider
-from enerf_ns.ray_samplers import PairedRayBundle, SharedJitter
+from enerf_ns.ray_samplers import PairedPDFSampler, PairedRayBundle, PairedUniformSampler, paired_rand
 
 PAIRS, FRAME_RAYS = 5, 4
 
@@ -37,55 +39,77 @@ def density(positions: Tensor) -> Tensor:
 
 
 def uniform_samples(rays: RayBundle, single_jitter: bool) -> RaySamples:
-    return UniformSampler(num_samples=16, single_jitter=single_jitter).train()(rays)
+    return PairedUniformSampler(num_samples=16, single_jitter=single_jitter).train()(rays)
 
 
-def proposal_samples(rays: RayBundle, single_jitter: bool) -> RaySamples:
+def proposal_samples(rays: RayBundle, single_jitter: bool, training: bool = True, paired: bool = True) -> RaySamples:
+    uniform, pdf = PairedUniformSampler(single_jitter=single_jitter), PairedPDFSampler(single_jitter=single_jitter)
+    if not paired:
+        uniform, pdf = UniformSampler(single_jitter=single_jitter), PDFSampler(None, True, single_jitter, False)
     sampler = ProposalNetworkSampler(
         num_proposal_samples_per_ray=(12,),
         num_nerf_samples_per_ray=8,
         num_proposal_network_iterations=1,
-        initial_sampler=UniformSampler(single_jitter=single_jitter),
-        pdf_sampler=PDFSampler(include_original=False, single_jitter=single_jitter),
+        initial_sampler=uniform,
+        pdf_sampler=pdf,
     )
-    return sampler.train()(rays, density_fns=[density])[0]
+    return sampler.train(training)(rays, density_fns=[density])[0]
 
 
 @pytest.mark.parametrize("single_jitter", [False, True])
 @pytest.mark.parametrize("sample", [uniform_samples, proposal_samples])
 def test_both_rays_of_a_pair_get_the_same_samples_and_other_rays_their_own(sample, single_jitter: bool):
     torch.manual_seed(0)
-    rays = paired_rays()
-    with SharedJitter(PAIRS):
-        starts = sample(rays, single_jitter).frustums.starts[..., 0]
+    starts = sample(paired_rays(), single_jitter).frustums.starts[..., 0]
     assert len(starts) == 2 * PAIRS + FRAME_RAYS
     torch.testing.assert_close(starts[:PAIRS], starts[PAIRS : 2 * PAIRS], rtol=0, atol=0)
     assert len(starts.unique(dim=0)) == PAIRS + FRAME_RAYS
 
 
 @pytest.mark.parametrize("sample", [uniform_samples, proposal_samples])
-def test_without_it_the_rays_of_a_pair_differ(sample):
+def test_rays_that_are_no_pairs_differ(sample):
     torch.manual_seed(0)
-    starts = sample(paired_rays(), True).frustums.starts[..., 0]
+    starts = sample(replace(paired_rays(), num_pairs=0), True).frustums.starts[..., 0]
     assert (starts[:PAIRS] != starts[PAIRS : 2 * PAIRS]).any(dim=1).all()
 
 
-def test_the_jitter_is_uniform_and_of_the_shape_type_and_device_asked_for():
+@pytest.mark.parametrize("single_jitter", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+def test_samples_of_single_rays_are_those_of_nerfstudio(training: bool, single_jitter: bool):
+    """By the same random numbers, from one density to another."""
+    rays = replace(paired_rays(), num_pairs=0)
+    found, expected = [], []
+    for paired, samples in ((True, found), (False, expected)):
+        torch.manual_seed(1)
+        samples.append(proposal_samples(rays, single_jitter, training, paired))
+        uniform = (PairedUniformSampler if paired else UniformSampler)(16, True, single_jitter)
+        samples.append(uniform.train(training)(rays))
+    for one, other in zip(found, expected, strict=True):
+        for name in ("starts", "ends", "origins", "directions"):
+            torch.testing.assert_close(getattr(one.frustums, name), getattr(other.frustums, name), rtol=0, atol=0)
+        torch.testing.assert_close(one.deltas, other.deltas, rtol=0, atol=0)
+        torch.testing.assert_close(one.spacing_starts, other.spacing_starts, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("weights", [torch.zeros(14, 12, 1), torch.full((14, 12, 1), 1e30)])
+def test_weights_of_any_size_give_samples_in_order_within_the_ray(weights: torch.Tensor):
+    rays = paired_rays()
+    coarse = PairedUniformSampler(12).train()(rays)
+    fine = PairedPDFSampler().train()(rays, coarse, weights, num_samples=8)
+    edges = torch.cat([fine.frustums.starts, fine.frustums.ends[:, -1:]], dim=1)[..., 0]
+    assert (edges.diff(dim=1) >= 0).all() and (edges >= 0.1).all() and (edges <= 2.0).all()
+
+
+def test_the_jitter_is_uniform_and_global_random_numbers_are_left_alone():
+    rays = paired_rays()
     torch.manual_seed(0)
-    with SharedJitter(1000):
-        drawn = torch.rand((2500, 4), dtype=torch.float64)
-        other = torch.randn(3, 4)
-    assert drawn.shape == (2500, 4) and drawn.dtype == torch.float64 and other.shape == (3, 4)
+    drawn = paired_rand(rays, 5000)
+    assert drawn.shape == (len(rays), 5000)
     assert drawn.min() >= 0 and drawn.max() < 1
-    assert drawn.mean().item() == pytest.approx(0.5, abs=0.02)
-
-
-def test_without_pairs_nothing_changes():
+    assert drawn.mean().item() == pytest.approx(0.5, abs=0.01)
     torch.manual_seed(0)
-    expected = torch.rand((6, 2))
-    torch.manual_seed(0)
-    with SharedJitter(0):
-        torch.testing.assert_close(torch.rand((6, 2)), expected, rtol=0, atol=0)
+    expected = torch.rand((PAIRS + FRAME_RAYS, 5000))
+    torch.testing.assert_close(drawn[PAIRS:], expected, rtol=0, atol=0)
 
 
 def test_the_number_of_pairs_survives_collider_slice_and_device():

@@ -44,8 +44,8 @@ class SensorModel(nn.Module):
 
     A pixel compares log brightness at two instants, fires one event per contrast threshold crossed, and is then blind
     for the refractory period. Here all of this are fixed numbers. A subclass that learns one of them holds it as a
-    parameter and overrides what uses it; nothing else changes, since everybody asks these methods and not for the
-    numbers, and whatever parameters there are get trained and stored.
+    parameter and overrides the property or method that gives it; nothing else changes, since everybody asks these, and
+    whatever parameters a sensor has are trained as the group "sensor" and stored with the run.
 
     Args:
         config: With nothing left open.
@@ -58,13 +58,18 @@ class SensorModel(nn.Module):
         super().__init__()
         assert config.contrast_thresholds is not None and config.response is not None
         assert config.refractory_period_ns is not None and config.bayer_pattern is not None
-        self.contrast_thresholds = config.contrast_thresholds
+        self._contrast_thresholds = config.contrast_thresholds
         self.response = response_named(config.response)
         self.refractory_period = config.refractory_period_ns
         self.colour_filter = None
         if config.bayer_pattern != GREY:
             assert config.width is not None
             self.colour_filter = ColourFilter(config.bayer_pattern, config.width)
+
+    @property
+    def contrast_thresholds(self) -> tuple[float | Tensor, float | Tensor]:
+        """C_on and C_off, in units of log brightness; numbers, or tensors where they are learned."""
+        return self._contrast_thresholds
 
     def log_brightness(
         self, rgb: Float[Tensor, "*batch channels"], pixels: Int64[Tensor, "*batch"]
@@ -88,12 +93,14 @@ class SensorModel(nn.Module):
             off: Number of negative events in the same interval.
             pixels: Their numbers, y * width + x.
         """
-        return self.contrast_thresholds[0] * on - self.contrast_thresholds[1] * off
+        c_on, c_off = self.contrast_thresholds
+        return c_on * on - c_off * off
 
     @property
-    def mean_threshold(self) -> float | Float[Tensor, ""]:
+    def mean_threshold(self) -> float | Tensor:
         """The unit in which losses count changes of log brightness."""
-        return 0.5 * (self.contrast_thresholds[0] + self.contrast_thresholds[1])
+        c_on, c_off = self.contrast_thresholds
+        return 0.5 * (c_on + c_off)
 
     def blind_after(
         self, event: Int64[Tensor, "*batch"], until: Int64[Tensor, "*batch"]

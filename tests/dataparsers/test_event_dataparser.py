@@ -24,8 +24,8 @@ from enerf_ns.dataparsers.event_dataparser import (
 )
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.event_dataset import EventDataset
+from enerf_ns.poses.posed_camera import PosedCamera
 
 NEAR, FAR = 0.5, 4.0
 FORMATS = {"esim": write_esim, "davis": write_davis}
@@ -112,30 +112,28 @@ def test_the_ray_of_a_picture_element_goes_through_its_centre(tmp_path: Path):
 def test_an_event_ray_meets_every_point_that_the_pixel_sees_at_that_time(tmp_path: Path, format: str):
     """With lens distortion for davis; between two poses."""
     folder = FORMATS[format](tmp_path / format)
-    parser = EventDataParserConfig(depth_range=(NEAR, FAR))
-    manager = EnerfDataManagerConfig(data=folder, dataparser=parser, pair_mode="partner").setup(
-        device="cpu", test_mode="val"
-    )
-    assert isinstance(manager, EnerfDataManager)
-    camera = read_recording(folder).camera
+    outputs, recording = parse(folder), read_recording(folder)
+    camera = recording.camera
+    posed = PosedCamera(camera, recording.trajectory, outputs.dataparser_transform, outputs.dataparser_scale)
     pixels = np.array([[0, 0], [23, 17], [3, 4], [12, 9]])
     times = np.array([0, 123_456_789, 550_000_001, 1_000_000_000])
     depths = [0.5, 1.0, 2.0, 4.0]
     points = [unproject(p, z, int(t), camera) for p, z, t in zip(pixels, depths, times, strict=True)]
-    rays = manager.event_rays(torch.from_numpy(pixels[:, 1] * 24 + pixels[:, 0]), torch.from_numpy(times))
-    assert distance_to_rays(rays, np.array(points), manager.train_dataparser_outputs).max() < 1e-5
+    rays = posed.rays(torch.from_numpy(pixels[:, 1] * 24 + pixels[:, 0]), torch.from_numpy(times))
+    assert distance_to_rays(rays, np.array(points), outputs).max() < 1e-5
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(4))
 
 
 def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
     """At a frame's time, the ray of a pixel is the ray of the picture's element, with the same bookkeeping."""
     folder = write_esim(tmp_path / "esim")
-    manager = EnerfDataManagerConfig(data=folder, dataparser=EventDataParserConfig(), pair_mode="partner").setup(
-        device="cpu"
+    outputs, recording = parse(folder), read_recording(folder)
+    time = int(outputs.metadata["frames"].times[0])
+    frame = outputs.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
+    transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+    event = PosedCamera(recording.camera, recording.trajectory, transform, scale).rays(
+        torch.arange(24 * 18), torch.full((24 * 18,), time)
     )
-    time = int(manager.train_dataset.frames.times[0])
-    frame = manager.train_dataset.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
-    event = manager.event_rays(torch.arange(24 * 18), torch.full((24 * 18,), time))
     torch.testing.assert_close(event.origins, frame.origins, rtol=0, atol=1e-6)
     torch.testing.assert_close(event.directions, frame.directions, rtol=0, atol=1e-6)
     torch.testing.assert_close(event.metadata["directions_norm"], frame.metadata["directions_norm"])

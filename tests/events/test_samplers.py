@@ -14,8 +14,9 @@ from scipy.stats import chisquare
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.events import samplers as event_sampler
-from enerf_ns.events.samplers import EventPairs, EventPairSampler, SilentPixelSampler
-from enerf_ns.sensor.sensor_model import measured_change
+from enerf_ns.events.batch import EventBatch
+from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
 
 WIDTH, HEIGHT = 5, 4
 MODES = ["successor", "partner", "window"]
@@ -63,11 +64,25 @@ def all_pairs(pixels: dict, mode: str, max_distance: int) -> list[tuple[int, int
     return pairs
 
 
-def rows(pairs: EventPairs) -> list[tuple[int, int, int]]:
+def rows(pairs: EventBatch) -> list[tuple[int, int, int]]:
     return list(zip(pairs.pixels.tolist(), pairs.start.tolist(), pairs.end.tolist(), strict=True))
 
 
-def assert_counts_are_right(pairs: EventPairs, pixels: dict) -> None:
+def sensor_with(refractory: int) -> SensorModel:
+    return SensorModel(
+        SensorModelConfig(
+            contrast_thresholds=THRESHOLDS, response="linlog", refractory_period_ns=refractory, bayer_pattern=GREY
+        )
+    )
+
+
+def seen_from(pairs: EventBatch, refractory: int) -> EventBatch:
+    """The pairs from when their pixels can see again."""
+    delays = sensor_with(refractory).blind_after(pairs.start, pairs.end)
+    return pairs if delays is None else replace(pairs, start=pairs.start + delays.long())
+
+
+def assert_counts_are_right(pairs: EventBatch, pixels: dict) -> None:
     for (pixel, start, end), on, off in zip(rows(pairs), pairs.on.tolist(), pairs.off.tolist(), strict=True):
         assert start < end
         fired = [p for t, p in pixels[pixel] if start < t <= end]
@@ -96,7 +111,8 @@ def test_pairs_are_uniform_and_count_their_events(mode, uniform_over, equal_stam
 
     pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(1))
     assert pairs.pixels.device.type == device
-    assert {tensor.dtype for tensor in vars(pairs).values()} == {torch.int64}
+    dtypes = {name: tensor.dtype for name, tensor in vars(pairs).items()}
+    assert dtypes.pop("silent") == torch.bool and set(dtypes.values()) == {torch.int64}
     assert_counts_are_right(pairs, pixels)
 
     drawn = Counter(rows(pairs))
@@ -124,11 +140,10 @@ def test_events_in_small_chunks_make_the_same_pairs(mode, equal_stamps: bool, ch
 def test_a_pair_begins_when_the_pixel_sees_again_and_never_at_its_end(mode, refractory: int) -> None:
     pixels = recording(True)
     expected = [(pixel, min(a + refractory, b - 1), b) for pixel, a, b in all_pairs(pixels, mode, 3)]
-    sampler = EventPairSampler(index_of(pixels), mode, 3, WINDOW, refractory_ns=refractory)
-    without = EventPairSampler(index_of(pixels), mode, 3, WINDOW)
-    pairs, same = (s.sample(60 * len(expected), torch.Generator().manual_seed(0)) for s in (sampler, without))
-    assert set(rows(pairs)) == set(expected)
-    assert torch.equal(pairs.on, same.on) and torch.equal(pairs.off, same.off)
+    sampler = EventPairSampler(index_of(pixels), mode, 3, WINDOW)
+    pairs = sampler.sample(60 * len(expected), torch.Generator().manual_seed(0))
+    assert not pairs.silent.any()
+    assert set(rows(seen_from(pairs, refractory))) == set(expected)
 
 
 def fire(signal: Callable[[float], float], end: float, on: float, off: float, refractory: int) -> list[tuple[int, int]]:
@@ -170,21 +185,21 @@ def test_successors_measure_the_threshold_and_other_pairs_miss_what_changes_whil
         for time, _ in events
     }
 
-    def errors(sampler: EventPairSampler) -> tuple[list[float], list[float]]:
+    def errors(sampler: EventPairSampler, refractory: int) -> tuple[list[float], list[float]]:
         """Of every drawn pair, the change that it measures too little, and what changed in between unseen."""
-        pairs = sampler.sample(2000, generator)
-        measured = measured_change(pairs.on.double(), pairs.off.double(), THRESHOLDS).tolist()
+        pairs = seen_from(sampler.sample(2000, generator), refractory)
+        measured = sensor_with(refractory).measured_change(pairs.on.double(), pairs.off.double(), pairs.pixels).tolist()
         changes = [signal_of(pixel)(end) - signal_of(pixel)(start) for pixel, start, end in rows(pairs)]
         unseen = [sum(blind[pixel, t] for t, _ in pixels[pixel] if a < t < b) for pixel, a, b in rows(pairs)]
         return [change - m for change, m in zip(changes, measured, strict=True)], unseen
 
     index = index_of(pixels)
-    error, unseen = errors(EventPairSampler(index, "successor", refractory_ns=refractory))
+    error, unseen = errors(EventPairSampler(index, "successor"), refractory)
     assert not any(unseen)
     np.testing.assert_allclose(error, 0.0, atol=1e-7)
-    error, unseen = errors(EventPairSampler(index, "partner", 4, refractory_ns=refractory))
+    error, unseen = errors(EventPairSampler(index, "partner", 4), refractory)
     np.testing.assert_allclose(error, unseen, atol=1e-7)
-    error, _ = errors(EventPairSampler(index, "successor"))
+    error, _ = errors(EventPairSampler(index, "successor"), 0)
     assert (max(map(abs, error)) > 0.01) == (refractory > 0)
 
 
@@ -268,10 +283,10 @@ def test_silent_pixels_are_silent(start, end, equal_stamps, min_duration, max_du
     pixels[1] = [(start, 1), (end, -1)]
     stretches = silent_stretches(pixels, start, end, refractory)
     long_enough = {pixel: [(a, b) for a, b in found if b - a >= min_duration] for pixel, found in stretches.items()}
-    sampler = SilentPixelSampler(index_of(pixels, device), start, end, min_duration, max_duration, refractory)
-    pairs = sampler.sample(3000, torch.Generator(device).manual_seed(2))
+    sampler = SilentPixelSampler(index_of(pixels, device), start, end, min_duration, max_duration)
+    pairs = sampler.sample(3000, torch.Generator(device).manual_seed(2), refractory)
     assert len(pairs) == 3000 and pairs.pixels.device.type == device
-    assert not pairs.on.any() and not pairs.off.any()
+    assert not pairs.on.any() and not pairs.off.any() and pairs.silent.all()
     assert_counts_are_right(pairs, pixels)
     for pixel, a, b in rows(pairs):
         assert a < b <= a + max_duration
@@ -292,8 +307,8 @@ def test_hot_pixels_only_look_silent(device: str) -> None:
 @pytest.mark.parametrize("refractory", [0, 60])
 def test_silent_pixels_are_drawn_in_proportion_to_their_silence(refractory: int) -> None:
     pixels = recording(False)
-    sampler = SilentPixelSampler(index_of(pixels), START, END, 100, 400, refractory)
-    pairs = sampler.sample(20_000, torch.Generator().manual_seed(3))
+    sampler = SilentPixelSampler(index_of(pixels), START, END, 100, 400)
+    pairs = sampler.sample(20_000, torch.Generator().manual_seed(3), refractory)
     stretches = silent_stretches(pixels, START, END, refractory)
     silence = np.array([sum(b - a + 1 for a, b in stretches[pixel] if b - a >= 100) for pixel in range(WIDTH * HEIGHT)])
     drawn = np.bincount(pairs.pixels.numpy(), minlength=WIDTH * HEIGHT)

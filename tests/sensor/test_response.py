@@ -8,11 +8,14 @@ import pytest
 import torch
 
 from enerf_ns.sensor.response import (
-    colour_channels,
+    ColourFilter,
+    Linlog,
+    Logarithm,
     inverse_linlog,
     linlog,
     luma,
     pixel_brightness,
+    response_named,
 )
 
 KNEE = 20.0 / 255.0
@@ -63,7 +66,7 @@ def test_luma_of_one_channel_is_that_channel():
 @pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "BGGR", "RRGB"])
 def test_every_pixel_sees_the_channel_of_its_filter(pattern: str, width: int, height: int):
     letters = [pattern[2 * (y % 2) + x % 2] for y in range(height) for x in range(width)]
-    channels = colour_channels(pattern, width, height)
+    channels = ColourFilter(pattern, width).channels(torch.arange(width * height))
     assert channels.dtype == torch.int64
     assert "".join("RGB"[channel] for channel in channels.tolist()) == "".join(letters)
 
@@ -71,17 +74,49 @@ def test_every_pixel_sees_the_channel_of_its_filter(pattern: str, width: int, he
 @pytest.mark.parametrize("pattern", ["", "RGB", "RGGBR", "RGBW", "rggb"])
 def test_what_is_no_colour_filter_is_refused(pattern: str):
     with pytest.raises(ValueError, match="four letters"):
-        colour_channels(pattern, 4, 4)
+        ColourFilter(pattern, 4)
 
 
 def test_a_mosaic_is_that_of_opencv_demosaiced():
     """OpenCV leaves the channel that a pixel sees as it is; it names patterns by the pixels (1, 1) to (2, 2)."""
     mosaic = np.random.default_rng(0).integers(0, 256, (8, 10), dtype=np.uint8)
     rgb = torch.from_numpy(cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2RGB)).float()
-    seen = pixel_brightness(rgb, colour_channels("RGGB", 10, 8).reshape(8, 10))
+    seen = pixel_brightness(rgb, ColourFilter("RGGB", 10).channels(torch.arange(80)).reshape(8, 10))
     np.testing.assert_array_equal(seen[1:-1, 1:-1], mosaic[1:-1, 1:-1])
 
 
 def test_a_grey_sensor_sees_luma():
     rgb = torch.rand(4, 5, 3)
     torch.testing.assert_close(pixel_brightness(rgb, None), luma(rgb), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001), Logarithm(1e-6)])
+def test_a_response_rises_and_its_inverse_undoes_it(response):
+    brightness = torch.linspace(0.0, 2.0, 1001, dtype=torch.float64)
+    levels = response(brightness)
+    assert (levels.diff() > 0).all()
+    torch.testing.assert_close(response.inverse(levels), brightness, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001)])
+def test_the_slope_of_a_response_is_that_of_finite_differences(response):
+    brightness = torch.linspace(0.001, 1.5, 40, dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(response, brightness, eps=1e-7, atol=1e-5)
+
+
+def test_the_two_responses_in_the_dark():
+    """From a brightness of 0.005 to 0.01 the paper's pixel and a simulator's see different changes."""
+    dark = torch.tensor([0.005, 0.01], dtype=torch.float64)
+    assert Logarithm(0.001)(dark).diff().item() == pytest.approx(math.log(0.011 / 0.006))
+    assert Linlog()(dark).diff().item() == pytest.approx(255 * 0.005 * math.log(20) / 20)
+
+
+@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001), Logarithm(0.25)])
+def test_a_response_is_found_by_its_name(response):
+    assert response_named(response.name) == response
+
+
+@pytest.mark.parametrize("name", ["", "log", "linlog:1", "logarithm", "logarithm:", "logarithm:0", "logarithm:nan"])
+def test_a_response_that_there_is_not_is_refused(name: str):
+    with pytest.raises(ValueError, match=r"linlog, or logarithm:OFFSET .* was expected"):
+        response_named(name)

@@ -3,20 +3,26 @@ from __future__ import annotations
 import pytest
 import torch
 
-from enerf_ns.supervision.losses import frame_loss, huber_event_loss, no_event_loss, normalised_event_loss
+from enerf_ns.supervision.losses import (
+    frame_loss,
+    huber_event_loss,
+    no_event_loss,
+    normalised_event_loss,
+    squared_event_loss,
+)
 
 PREDICTED = torch.tensor([0.5, -0.25, 0.0])
 MEASURED = torch.tensor([0.25, -0.5, 0.5])
 
 
 def test_event_loss_is_the_squared_error_in_thresholds():
-    assert event_loss(PREDICTED, MEASURED, 0.25).item() == pytest.approx((1 + 1 + 4) / 3)
-    assert event_loss(MEASURED, MEASURED, 0.25).item() == 0.0
+    assert squared_event_loss(PREDICTED, MEASURED, 0.25).item() == pytest.approx((1 + 1 + 4) / 3)
+    assert squared_event_loss(MEASURED, MEASURED, 0.25).item() == 0.0
 
 
 def test_event_loss_does_not_depend_on_the_unit_of_brightness():
-    loss = event_loss(PREDICTED, MEASURED, 0.25)
-    torch.testing.assert_close(event_loss(3 * PREDICTED, 3 * MEASURED, 0.75), loss)
+    loss = squared_event_loss(PREDICTED, MEASURED, 0.25)
+    torch.testing.assert_close(squared_event_loss(3 * PREDICTED, 3 * MEASURED, 0.75), loss)
 
 
 @pytest.mark.parametrize(
@@ -77,6 +83,18 @@ def test_no_event_loss_is_a_mean_over_pairs():
     assert no_event_loss(torch.tensor([0.5, 0.0]), (0.2, 0.4)).item() == pytest.approx(0.5)
 
 
-def test_frame_loss():
-    predicted, target = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.5, 0.5, 0.5]])
-    assert frame_loss(predicted, target).item() == pytest.approx(0.5 / 3)
+RENDERED, RECORDED = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.5, 0.25, 0.5]])
+
+
+def test_frames_in_colour_are_compared_channel_by_channel():
+    assert frame_loss(RENDERED, RECORDED, grey=False).item() == pytest.approx((0.25 + 0.0625 + 0.25) / 3)
+
+
+def test_a_grey_field_is_compared_by_brightness():
+    difference = 0.299 * -0.5 + 0.587 * 0.25 + 0.114 * 0.5
+    assert frame_loss(RENDERED, RECORDED, grey=True).item() == pytest.approx(difference**2)
+
+
+def test_frames_that_are_grey_are_compared_by_brightness():
+    brightness = 0.587 * 0.5 + 0.114
+    assert frame_loss(RENDERED, torch.full((1, 3), 0.5), grey=False).item() == pytest.approx((brightness - 0.5) ** 2)
