@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Protocol, TypeVar
 
@@ -314,7 +314,10 @@ class _Resolver:
 
         name = f"{DATAPARSER}.depth_range"
         box = self.use(f"{DATAPARSER}.box", lambda: None)
-        near, far = self.use(name, lambda: depth_range(recording, self.parser))
+        stated = self.use(name, lambda: None)
+        near, far = depth_range(recording, replace(self.parser, depth_range=stated))
+        if stated is None:
+            self.values[name] = near, far
         _, scale, _ = scene_normalisation(recording, near, far, box)
         if box is None:
             value = f"box of depths {near:.2f} m to {far:.2f} m"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,28 @@ def device(request: pytest.FixtureRequest) -> str:
         if not torch.cuda.is_available():
             pytest.skip("no CUDA device")
     return request.param
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tenth of a second of a small camera, with grey frames, sharp and blurred, and depth."""
+    from enerf_ns.scripts.simulate import Simulate
+
+    folder = tmp_path_factory.mktemp("simulated") / "recording"
+    Simulate(folder, "shapes", width=32, height=24, duration=0.1, num_frames=11, exposure_ms=5.0).main()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def colour_recording(recording: Path) -> Path:
+    """The same with frames in colour."""
+    import numpy as np
+    from PIL import Image
+
+    from enerf_ns.dataparsers.files import load_image
+
+    folder = recording.with_name("colour")
+    shutil.copytree(recording, folder)
+    for file in [*folder.glob("images/*.png"), *folder.glob("images_corrupted/*.png")]:
+        Image.fromarray((load_image(file) * np.array([1.0, 0.8, 0.5])).astype(np.uint8)).save(file)
+    return folder

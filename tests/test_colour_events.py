@@ -259,12 +259,8 @@ def test_the_refractory_period_reaches_the_rays_and_the_table(recording: EventRe
     why = next(choice.why for choice in resolve(config, blind).choices if choice.part == "event loss")
     assert "8 ms" in why and ("successor" in why) == approximate
     pipeline = config.setup(device="cpu")
-    batch, sensor, index = (
-        pipeline.datamanager.next_batch(pipeline.model.sensor),
-        pipeline.model.sensor,
-        index_events(blind),
-    )
-    events = batch.events
+    sensor, index = pipeline.model.sensor, index_events(blind)
+    events: Any = pipeline.datamanager.next_batch(sensor).events
     assert torch.isin(events.start[~events.silent], index.times).all()
     blind_for = sensor.blind_after(events.start, events.end)
     assert ((blind_for == 8_000_000) | (events.start + blind_for == events.end - 1)).all()

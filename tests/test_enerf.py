@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -13,73 +10,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils.eval_utils import eval_setup
-from PIL import Image
+from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, set_up, small_config
 
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.sensor.response import luma
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES, brightness_change
 
-WIDTH, HEIGHT = 32, 24
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tenth of a second of a small camera, with grey frames, sharp and blurred, and depth."""
-    folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate(folder, "shapes", width=WIDTH, height=HEIGHT, duration=0.1, num_frames=11, exposure_ms=5.0).main()
-    return folder
-
-
-@pytest.fixture(scope="module")
-def colour_recording(recording: Path) -> Path:
-    """The same with frames in colour."""
-    folder = recording.with_name("colour")
-    shutil.copytree(recording, folder)
-    for file in [*folder.glob("images/*.png"), *folder.glob("images_corrupted/*.png")]:
-        Image.fromarray((load_image(file) * np.array([1.0, 0.8, 0.5])).astype(np.uint8)).save(file)
-    return folder
-
-
-def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> EnerfTrainerConfig:
-    """A registered method with a small batch, a small field and few losses, and changes like `model__num_samples=8`."""
-    config = copy.deepcopy(method.config)
-    assert isinstance(config, EnerfTrainerConfig)
-    config.data, config.output_dir = data, output_dir
-    config.vis, config.timestamp = "tensorboard", "run"
-    config.machine.device_type = "cpu"
-    config.max_num_iterations = 2
-    manager, model = config.pipeline.datamanager, config.pipeline.model
-    manager.event_pairs = manager.train_num_rays_per_batch = 64
-    manager.silent_pairs, manager.silence_ms = 0, 5.0
-    model.opacity_loss_weight, model.distortion_loss_weight = 0.0, 0.01
-    model.log2_table_size, model.num_levels = 12, 4
-    model.num_samples = model.num_proposal_samples = 16
-    parts = {"data": manager, "model": model, "sensor": model.sensor}
-    for name, value in changes.items():
-        part, field = name.split("__")
-        assert hasattr(parts[part], field)
-        setattr(parts[part], field, value)
-    return config
-
-
-def set_up(config: EnerfTrainerConfig) -> Any:
-    """A trainer as `ns-train` makes it, set up."""
-    _set_random_seed(config.machine.seed)
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    trainer.pipeline.train()
-    return trainer
-
-
-EVENTS = {"event_loss", "distortion_loss", "interlevel_loss"}
 SILENT = {"data__silent_pairs": 32}
 
 CONFIGURATIONS = {
@@ -101,6 +40,7 @@ CONFIGURATIONS = {
     "colour": ({"model__num_channels": 3}, EVENTS),
     "no distortion loss": ({"model__distortion_loss_weight": 0.0}, {"event_loss", "interlevel_loss"}),
 }
+
 """Changes, and the losses that there are then."""
 
 CHOICES = [
@@ -110,25 +50,10 @@ CHOICES = [
     if get_origin(hint) is Literal and name in config.__annotations__
     for value in get_args(hint)
 ]
+
 CHOICES += [("model__event_loss", name) for name in EVENT_LOSSES]
+
 """Every value of every choice that the method has of its own."""
-
-
-def check_two_steps(config: EnerfTrainerConfig, expected_losses: set[str]) -> Any:
-    """Every loss is there and finite, and every parameter moves; the trainer."""
-    trainer = set_up(config)
-    before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.named_parameters()}
-    for step in range(2):
-        loss, losses, metrics = trainer.train_iteration(step)
-        assert set(losses) == expected_losses
-        assert loss.isfinite() and all(value.isfinite() for value in losses.values())
-        torch.testing.assert_close(loss, sum(losses.values()))
-        assert ("event_correlation" in metrics) == ("event_loss" in expected_losses)
-        assert ("frame_psnr" in metrics) == ("frame_loss" in expected_losses)
-    for name, parameter in trainer.pipeline.model.named_parameters():
-        moved = (parameter != before[name]).any() or parameter.numel() == 0  # Nerfstudio keeps an empty one
-        assert parameter.isfinite().all() and moved, name
-    return trainer
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
@@ -183,47 +108,8 @@ def test_two_steps_with_frames_in_colour_and_grey_events(colour_recording: Path,
     if "events" in supervision:
         start, end, _ = batch.split(rgb)
         predicted = brightness_change(start, end, batch.events, model.sensor)
-        grey = [luma(shown)[:, None].expand(-1, 3) for shown in (start, end)]
-        torch.testing.assert_close(brightness_change(*grey, batch.events, model.sensor), predicted)
-
-
-@pytest.mark.parametrize("supervision", ["events", "events+frames"])
-def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colour_recording, tmp_path, supervision):
-    data = colour_recording if supervision == "events" else recording
-    config = small_config(data, tmp_path, data__supervision=supervision).resolved()
-    assert config.pipeline.resolution.values["model.num_channels"] == 1
-
-
-def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: Path):
-    """Pairs against the raw events of the recording, frame rays against the picture files."""
-    config = small_config(
-        colour_recording,
-        tmp_path,
-        data__supervision="events+frames",
-        data__silent_pairs=10,
-        data__train_num_rays_per_batch=20,
-    )
-    pipeline = set_up(config).pipeline
-    manager = pipeline.datamanager
-    batch = manager.next_batch(pipeline.model.sensor)
-    rays = manager.rays(batch, pipeline.model.sensor)
-    assert batch.num_pairs == rays.num_pairs == 64 + 10
-    assert len(rays) == manager.get_train_rays_per_batch() == 2 * 74 + 20
-    events, frames = batch.events, batch.frames
-    assert (~events.silent).sum() == 64 and ((events.on + events.off > 0) == ~events.silent).all()
-    assert len(frames.colours) == 20
-    parts = batch.split(torch.arange(len(rays))[:, None])
-    assert [len(part) for part in parts] == [74, 74, 20] and torch.cat(parts).flatten().tolist() == [*range(168)]
-
-    files = manager.train_dataset.frames.filenames
-    assert all(file.parent.name == "images_corrupted" for file in files)
-    for colour, (frame, row, column) in zip(frames.colours, frames.indices.tolist(), strict=True):
-        np.testing.assert_allclose(colour, load_image(files[frame])[row, column] / 255.0, atol=1e-6)
-    frame, row, column = frames.indices.T
-    coordinates = torch.stack([row, column], dim=-1) + 0.5
-    expected = manager.train_dataset.cameras.generate_rays(camera_indices=frame[:, None], coords=coordinates)
-    torch.testing.assert_close(rays.origins[-20:], expected.origins, rtol=0, atol=1e-6)
-    torch.testing.assert_close(rays.directions[-20:], expected.directions, rtol=0, atol=1e-6)
+        start, end = (luma(shown)[:, None].expand(-1, 3) for shown in (start, end))
+        torch.testing.assert_close(brightness_change(start, end, batch.events, model.sensor), predicted)
 
 
 def test_the_same_seed_gives_the_same_losses_and_another_seed_others(recording: Path, tmp_path: Path):
@@ -311,105 +197,3 @@ def test_loading_a_checkpoint_that_does_not_fit_is_an_error(trained: Any, tmp_pa
     torch.save(checkpoint, file)
     with pytest.raises(RuntimeError, match=r"geometry\.grid\.table"):
         eval_setup(run / "config.yml")
-
-
-def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, monkeypatch):
-    """Choices are stored beside what was set, paths are absolute; what was stored loads and prints as it was."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "link").symlink_to(recording)
-    config = small_config(Path("link"), Path("outputs"))
-    config.save_config()
-    run = tmp_path / "outputs/recording/enerf/run"
-    loaded = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
-    assert loaded == loaded.resolved() == replace(config.resolved(), experiment_name="recording")
-    assert loaded.pipeline.model.num_channels is None and loaded.pipeline.datamanager.dataparser.depth_range is None
-    filled = loaded.pipeline.resolution.applied_to(loaded.pipeline)
-    manager, model = filled.datamanager, filled.model
-    for path in (loaded.data, manager.data, manager.dataparser.data):
-        assert path == recording.resolve()
-    assert loaded.output_dir == tmp_path / "outputs"
-    simulated = json.loads((recording / "simulation.json").read_text())
-    assert model.sensor.contrast_thresholds == tuple(simulated["contrast_thresholds"])
-    assert manager.dataparser.depth_range == pytest.approx(simulated["depth_range"])
-    assert model.num_channels == 1 and model.max_res > model.base_res and 0 < model.near_plane < 1
-    choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
-    assert choices["event loss"]["kept"] and not choices["no-event loss"]["kept"] and not choices["frame loss"]["kept"]
-    assert all(choice["why"] for choice in choices.values())
-
-
-def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
-    forced = {"max_res": 99, "near_plane": 0.05, "num_channels": 3}
-    config = small_config(recording, tmp_path, **{f"model__{name}": value for name, value in forced.items()})
-    config.pipeline.model.sensor.contrast_thresholds = (0.1, 0.3)
-    config.pipeline.datamanager.dataparser.depth_range = (1.0, 2.0)
-    resolution = config.resolved().pipeline.resolution
-    filled = resolution.applied_to(config.pipeline)
-    assert {name: getattr(filled.model, name) for name in forced} == forced
-    assert filled.model.sensor.contrast_thresholds == (0.1, 0.3)
-    assert filled.datamanager.dataparser.depth_range == (1.0, 2.0)
-    why = {choice.part: choice.why for choice in resolution.choices}
-    assert {why[part] for part in ("contrast thresholds", "colour", "contraction", "hash grid")} == {"set by flag"}
-
-
-def test_the_registered_method_is_left_as_it_was(recording: Path, tmp_path: Path):
-    before = copy.deepcopy(enerf.config)
-    config = small_config(recording, tmp_path)
-    given = copy.deepcopy(config)
-    config.save_config()
-    config.setup()
-    assert config == given and enerf.config == before
-
-
-def test_frames_that_are_not_there_cannot_be_learnt_from(recording: Path, tmp_path: Path):
-    folder = tmp_path / "without_frames"
-    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
-    config = small_config(folder, tmp_path / "outputs", data__supervision="events+frames")
-    with pytest.raises(SystemExit, match=r"without_frames.*no frames.*--pipeline\.datamanager\.supervision"):
-        config.save_config()
-    assert not (tmp_path / "outputs").exists()
-    check_two_steps(small_config(folder, tmp_path / "outputs"), EVENTS)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"data__pair_mode": "window", "data__window_ms": 1e-6}, {"data__silent_pairs": 8, "data__silence_ms": 0.0}],
-)
-def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path, tmp_path: Path, changes: dict):
-    with pytest.raises(SystemExit, match=r"enerf: .*recording") as error:
-        set_up(small_config(recording, tmp_path, **changes))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "held_out_every", "message"),
-    [
-        ({"model__event_loss": "hubert"}, 4, "--pipeline.model.event-loss is 'hubert', but one of huber, squared"),
-        ({"sensor__response": "log"}, 4, "--pipeline.model.response is the response 'log', but linlog, or"),
-        ({"sensor__bayer_pattern": "RGBW"}, 4, "--pipeline.model.bayer-pattern is a colour filter 'RGBW', but"),
-        ({"sensor__refractory_period_ns": -1}, 4, "--refractory-period-ns is -1"),
-        ({}, 0, "--held-out-every 0"),
-        ({"data__supervision": "frames"}, 1, "--held-out-every 1 .*11 frames"),
-        ({"data__supervision": "events+frames"}, 22, "--held-out-every 22 .*11 frames"),
-        ({"sensor__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
-    ],
-)
-def test_flags_that_cannot_be_followed(
-    recording: Path, tmp_path: Path, changes: dict, held_out_every: int, message: str
-):
-    config = small_config(recording, tmp_path, **changes)
-    config.pipeline.datamanager.dataparser.held_out_every = held_out_every
-    with pytest.raises(SystemExit, match=message):
-        config.save_config()
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_learning_rate_falls_to_a_tenth_at_the_last_step_however_long_the_run(recording: Path, tmp_path: Path):
-    config = small_config(recording, tmp_path)
-    config.max_num_iterations = 7
-    trainer = set_up(config)
-    rates = []
-    for step in range(8):
-        rates.append(trainer.optimizers.optimizers["fields"].param_groups[0]["lr"])
-        trainer.train_iteration(step)
-    ratio = np.array(rates[1:]) / np.array(rates[:-1])
-    np.testing.assert_allclose(ratio, 0.1 ** (1 / 7), rtol=1e-6)

@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import torch
+
+from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
+
+
+def events(number: int, first: int, silent: bool) -> EventBatch:
+    columns = (torch.arange(first + i, first + i + number) for i in range(5))
+    return EventBatch(*columns, silent=torch.full((number,), silent))
+
+
+def test_batches_are_joined_in_their_order():
+    joined = EventBatch.joined([events(3, 0, False), events(2, 100, True)])
+    assert len(joined) == 5
+    assert joined.pixels.tolist() == [0, 1, 2, 100, 101]
+    assert joined.off.tolist() == [4, 5, 6, 104, 105]
+    assert joined.silent.tolist() == [False, False, False, True, True]
+
+
+def test_what_was_rendered_is_taken_apart_as_its_rays_were_put_together():
+    frames = FrameBatch(torch.zeros(4, 3, dtype=torch.int64), torch.zeros(4, 3))
+    rendered = torch.arange(14)[:, None]
+    parts = TrainBatch(events(5, 0, False), frames).split(rendered)
+    assert [part.flatten().tolist() for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9], [10, 11, 12, 13]]
+
+
+def test_without_events_all_is_frames_and_without_frames_all_is_events():
+    frames = FrameBatch(torch.zeros(4, 3, dtype=torch.int64), torch.zeros(4, 3))
+    assert [len(part) for part in TrainBatch(None, frames).split(torch.zeros(4, 1))] == [0, 0, 4]
+    assert [len(part) for part in TrainBatch(events(2, 0, True), None).split(torch.zeros(4, 1))] == [2, 2, 0]

@@ -1,0 +1,172 @@
+"""What is used for a scene: what the user set, else what the recording says, else what the method has."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from small_runs import EVENTS, WIDTH, check_two_steps, small_config
+
+from enerf_ns.choices import Choice, Resolution, is_colour, resolve
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.enerf_config import enerf, enerf_paper
+from enerf_ns.sensor.response import Logarithm
+
+
+@pytest.mark.parametrize("supervision", ["events", "events+frames"])
+def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colour_recording, tmp_path, supervision):
+    data = colour_recording if supervision == "events" else recording
+    config = small_config(data, tmp_path, data__supervision=supervision).resolved()
+    assert config.pipeline.resolution.values["model.num_channels"] == 1
+
+
+def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
+    forced = {"max_res": 99, "near_plane": 0.05, "num_channels": 3}
+    config = small_config(recording, tmp_path, **{f"model__{name}": value for name, value in forced.items()})
+    config.pipeline.model.sensor.contrast_thresholds = (0.1, 0.3)
+    config.pipeline.datamanager.dataparser.depth_range = (1.0, 2.0)
+    resolution = config.resolved().pipeline.resolution
+    filled = resolution.applied_to(config.pipeline)
+    assert {name: getattr(filled.model, name) for name in forced} == forced
+    assert filled.model.sensor.contrast_thresholds == (0.1, 0.3)
+    assert filled.datamanager.dataparser.depth_range == (1.0, 2.0)
+    why = {choice.part: choice.why for choice in resolution.choices}
+    assert {why[part] for part in ("contrast thresholds", "colour", "contraction", "hash grid")} == {"set by flag"}
+
+
+def test_the_registered_method_is_left_as_it_was(recording: Path, tmp_path: Path):
+    before = copy.deepcopy(enerf.config)
+    config = small_config(recording, tmp_path)
+    given = copy.deepcopy(config)
+    config.save_config()
+    config.setup()
+    assert config == given and enerf.config == before
+
+
+def test_frames_that_are_not_there_cannot_be_learnt_from(recording: Path, tmp_path: Path):
+    folder = tmp_path / "without_frames"
+    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
+    config = small_config(folder, tmp_path / "outputs", data__supervision="events+frames")
+    with pytest.raises(SystemExit, match=r"without_frames.*no frames.*--pipeline\.datamanager\.supervision"):
+        config.save_config()
+    assert not (tmp_path / "outputs").exists()
+    check_two_steps(small_config(folder, tmp_path / "outputs"), EVENTS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "held_out_every", "message"),
+    [
+        ({"model__event_loss": "hubert"}, 4, "--pipeline.model.event-loss is 'hubert', but one of huber, squared"),
+        ({"sensor__response": "log"}, 4, "--pipeline.model.response is the response 'log', but linlog, or"),
+        ({"sensor__bayer_pattern": "RGBW"}, 4, "--pipeline.model.bayer-pattern is a colour filter 'RGBW', but"),
+        ({"sensor__refractory_period_ns": -1}, 4, "--refractory-period-ns is -1"),
+        ({}, 0, "--held-out-every 0"),
+        ({"data__supervision": "frames"}, 1, "--held-out-every 1 .*11 frames"),
+        ({"data__supervision": "events+frames"}, 22, "--held-out-every 22 .*11 frames"),
+        ({"sensor__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
+    ],
+)
+def test_flags_that_cannot_be_followed(
+    recording: Path, tmp_path: Path, changes: dict, held_out_every: int, message: str
+):
+    config = small_config(recording, tmp_path, **changes)
+    config.pipeline.datamanager.dataparser.held_out_every = held_out_every
+    with pytest.raises(SystemExit, match=message):
+        config.save_config()
+    assert not list(tmp_path.iterdir())
+
+
+def resolution_of(recording: Path, tmp_path: Path, **changes: Any) -> Resolution:
+    return small_config(recording, tmp_path, **changes).resolved().pipeline.resolution
+
+
+def rows(resolution: Resolution) -> dict[str, Choice]:
+    return {choice.part: choice for choice in resolution.choices}
+
+
+def test_without_flags_the_recording_decides_and_then_the_method(recording: Path, tmp_path: Path):
+    resolution = resolve(enerf.config.pipeline, read_recording(recording))
+    values, simulated = resolution.values, read_recording(recording)
+    assert values["model.sensor.contrast_thresholds"] == simulated.contrast_thresholds
+    assert values["datamanager.dataparser.depth_range"] == simulated.depth_range
+    assert values["model.sensor.response"] == "linlog" and values["model.sensor.bayer_pattern"] == "grey"
+    assert values["datamanager.pair_mode"] == "partner" and values["model.num_channels"] == 1
+    assert values["datamanager.event_pairs"] == 1024 and values["datamanager.silent_pairs"] == 341
+    paper = resolve(enerf_paper.config.pipeline, read_recording(recording)).values
+    assert paper["datamanager.event_pairs"] == 30096 and paper["datamanager.silent_pairs"] == 0
+    assert paper["model.event_loss"] == "squared" and "datamanager.pair_mode" not in paper
+    assert rows(resolution)["contrast thresholds"].why == "the recording states them"
+
+
+def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp_path: Path):
+    unknown = replace(read_recording(recording), contrast_thresholds=None)
+    resolution = resolve(enerf.config.pipeline, unknown)
+    on, off = resolution.values["model.sensor.contrast_thresholds"]
+    index = index_events(unknown)
+    assert on * index.num_positive == pytest.approx(off * (len(index) - index.num_positive))
+    assert f"{index.num_positive:,} on" in rows(resolution)["contrast thresholds"].why
+
+
+def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_path: Path):
+    stated = replace(
+        read_recording(recording), response="logarithm:0.01", refractory_period=3_000_000, bayer_pattern="RGGB"
+    )
+    resolution = resolve(enerf.config.pipeline, stated)
+    sensor = resolution.applied_to(enerf.config.pipeline).model.sensor.setup()
+    assert sensor.response == Logarithm(0.01) and sensor.refractory_period == 3_000_000
+    assert sensor.colour_filter is not None and resolution.values["model.num_channels"] == 3
+    assert resolution.values["datamanager.pair_mode"] == "successor"
+    assert rows(resolution)["response"].why == "the recording states it"
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "part"),
+    [
+        ("sensor__response", "logarithm:0.1", "response"),
+        ("sensor__contrast_thresholds", (0.25, 0.25), "contrast thresholds"),
+        ("model__max_res", 64, "hash grid"),
+        ("model__num_channels", 1, "colour"),
+    ],
+)
+def test_a_flag_stands_and_is_said_to(recording: Path, tmp_path: Path, setting: str, value: Any, part: str):
+    resolution = resolution_of(recording, tmp_path, **{setting: value})
+    assert not any(name.endswith(setting.rpartition("__")[2]) for name in resolution.values)
+    assert rows(resolution)[part].why == "set by flag"
+
+
+def test_what_is_applied_fills_in_what_is_open_and_leaves_the_config_alone(recording: Path):
+    config = copy.deepcopy(enerf.config.pipeline)
+    config.model.max_res, config.datamanager.silent_pairs = 77, 0
+    before = copy.deepcopy(config)
+    resolution = resolve(config, read_recording(recording))
+    filled = Resolution({**resolution.values, "model.max_res": 5, "datamanager.silent_pairs": 9}).applied_to(config)
+    assert config == before
+    assert (filled.model.max_res, filled.datamanager.silent_pairs) == (77, 0)
+    assert filled.model.num_channels == 1 and filled.model.sensor.width == WIDTH
+
+
+def test_two_answers_to_one_question_are_equal_and_can_be_stored(recording: Path):
+    first, second = (resolve(enerf.config.pipeline, read_recording(recording)) for _ in range(2))
+    assert first == second == yaml.load(yaml.dump(first), Loader=yaml.Loader)
+
+
+def test_a_picture_of_grey_is_no_colour():
+    grey = np.repeat(np.arange(12, dtype=np.uint8).reshape(3, 4, 1), 3, axis=2)
+    assert not is_colour(grey) and not is_colour(grey[..., :1])
+    grey[1, 2, 2] += 1
+    assert is_colour(grey)
+
+
+@pytest.mark.parametrize("depth", [(0.0, 1.0), (2.0, 1.0), (1.0, float("inf")), (float("nan"), 2.0)])
+def test_a_depth_range_that_is_none_is_refused_before_anything_is_written(recording: Path, tmp_path: Path, depth):
+    config = small_config(recording, tmp_path / "outputs")
+    config.pipeline.datamanager.dataparser.depth_range = depth
+    with pytest.raises(SystemExit, match="depth range is"):
+        config.save_config()
+    assert not (tmp_path / "outputs").exists()

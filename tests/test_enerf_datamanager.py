@@ -1,0 +1,98 @@
+"""What a step draws, against the raw events and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_runs import HEIGHT, WIDTH, set_up, small_config
+
+from enerf_ns.dataparsers.files import load_image
+
+
+def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: Path):
+    """Pairs against the raw events of the recording, frame rays against the picture files."""
+    config = small_config(
+        colour_recording,
+        tmp_path,
+        data__supervision="events+frames",
+        data__silent_pairs=10,
+        data__train_num_rays_per_batch=20,
+    )
+    pipeline = set_up(config).pipeline
+    manager = pipeline.datamanager
+    batch = manager.next_batch(pipeline.model.sensor)
+    rays = manager.rays(batch, pipeline.model.sensor)
+    assert batch.num_pairs == rays.num_pairs == 64 + 10
+    assert len(rays) == manager.get_train_rays_per_batch() == 2 * 74 + 20
+    events, frames = batch.events, batch.frames
+    assert (~events.silent).sum() == 64 and ((events.on + events.off > 0) == ~events.silent).all()
+    assert len(frames.colours) == 20
+    parts = batch.split(torch.arange(len(rays))[:, None])
+    assert [len(part) for part in parts] == [74, 74, 20] and torch.cat(parts).flatten().tolist() == [*range(168)]
+
+    files = manager.train_dataset.frames.filenames
+    assert all(file.parent.name == "images_corrupted" for file in files)
+    for colour, (frame, row, column) in zip(frames.colours, frames.indices.tolist(), strict=True):
+        np.testing.assert_allclose(colour, load_image(files[frame])[row, column] / 255.0, atol=1e-6)
+    frame, row, column = frames.indices.T
+    coordinates = torch.stack([row, column], dim=-1) + 0.5
+    expected = manager.train_dataset.cameras.generate_rays(camera_indices=frame[:, None], coords=coordinates)
+    torch.testing.assert_close(rays.origins[-20:], expected.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rays.directions[-20:], expected.directions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"data__pair_mode": "window", "data__window_ms": 1e-6}, {"data__silent_pairs": 8, "data__silence_ms": 0.0}],
+)
+def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path, tmp_path: Path, changes: dict):
+    with pytest.raises(SystemExit, match=r"enerf: .*recording") as error:
+        set_up(small_config(recording, tmp_path, **changes))
+    assert "\n" not in str(error.value)
+
+
+def test_tools_that_look_at_a_scene_get_pixels_of_the_train_cameras(recording: Path, tmp_path: Path):
+    """As many as ns-export asks for, evenly over frames, rows and columns."""
+    manager = set_up(small_config(recording, tmp_path)).pipeline.datamanager
+    manager.train_pixel_sampler.num_rays_per_batch = 6000
+    rays, batch = manager.next_train(0)
+    assert len(rays) == 6000 and not hasattr(rays, "num_pairs")
+    sizes = len(manager.train_dataset), HEIGHT, WIDTH
+    for column, size in zip(batch["indices"].T, sizes, strict=True):
+        counts = torch.bincount(column, minlength=size)
+        assert len(counts) == size and counts.min() > 0.5 * counts.float().mean()
+    expected = manager.train_dataset.cameras.generate_rays(
+        camera_indices=batch["indices"][:, :1], coords=batch["indices"][:, 1:] + 0.5
+    )
+    torch.testing.assert_close(rays.origins, expected.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=1e-6)
+
+
+def test_a_run_that_is_only_looked_at_indexes_no_events(recording: Path, tmp_path: Path, monkeypatch):
+    config = small_config(recording, tmp_path).resolved()
+    asked = []
+    monkeypatch.setattr("enerf_ns.enerf_datamanager.index_events", asked.append)
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    pipeline.datamanager.next_train(0)
+    assert not asked
+
+
+def test_evaluation_changes_nothing_of_training(recording: Path, tmp_path: Path):
+    """Training goes on with the same draws, with and without an evaluation in between."""
+
+    def losses(evaluate: bool) -> list[float]:
+        trainer = set_up(small_config(recording, tmp_path, data__silent_pairs=16))
+        found = []
+        for step in range(3):
+            if evaluate:
+                state = torch.get_rng_state()
+                trainer.pipeline.get_average_eval_image_metrics()
+                trainer.pipeline.event_correlation(256)
+                torch.set_rng_state(state)
+            found.append(trainer.train_iteration(step)[0].item())
+        return found
+
+    assert losses(evaluate=True) == losses(evaluate=False)
