@@ -18,6 +18,9 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.sensor.response import Logarithm
 
+ENERF: Any = enerf.config.pipeline
+PAPER: Any = enerf_paper.config.pipeline
+
 
 @pytest.mark.parametrize("supervision", ["events", "events+frames"])
 def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colour_recording, tmp_path, supervision):
@@ -91,14 +94,14 @@ def rows(resolution: Resolution) -> dict[str, Choice]:
 
 
 def test_without_flags_the_recording_decides_and_then_the_method(recording: Path, tmp_path: Path):
-    resolution = resolve(enerf.config.pipeline, read_recording(recording))
+    resolution = resolve(ENERF, read_recording(recording))
     values, simulated = resolution.values, read_recording(recording)
     assert values["model.sensor.contrast_thresholds"] == simulated.contrast_thresholds
     assert values["datamanager.dataparser.depth_range"] == simulated.depth_range
     assert values["model.sensor.response"] == "linlog" and values["model.sensor.bayer_pattern"] == "grey"
     assert values["datamanager.pair_mode"] == "partner" and values["model.num_channels"] == 1
     assert values["datamanager.event_pairs"] == 1024 and values["datamanager.silent_pairs"] == 341
-    paper = resolve(enerf_paper.config.pipeline, read_recording(recording)).values
+    paper = resolve(PAPER, read_recording(recording)).values
     assert paper["datamanager.event_pairs"] == 30096 and paper["datamanager.silent_pairs"] == 0
     assert paper["model.event_loss"] == "squared" and "datamanager.pair_mode" not in paper
     assert rows(resolution)["contrast thresholds"].why == "the recording states them"
@@ -106,7 +109,7 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
 
 def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp_path: Path):
     unknown = replace(read_recording(recording), contrast_thresholds=None)
-    resolution = resolve(enerf.config.pipeline, unknown)
+    resolution = resolve(ENERF, unknown)
     on, off = resolution.values["model.sensor.contrast_thresholds"]
     index = index_events(unknown)
     assert on * index.num_positive == pytest.approx(off * (len(index) - index.num_positive))
@@ -117,8 +120,8 @@ def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_pa
     stated = replace(
         read_recording(recording), response="logarithm:0.01", refractory_period=3_000_000, bayer_pattern="RGGB"
     )
-    resolution = resolve(enerf.config.pipeline, stated)
-    sensor = resolution.applied_to(enerf.config.pipeline).model.sensor.setup()
+    resolution = resolve(ENERF, stated)
+    sensor = resolution.applied_to(ENERF).model.sensor.setup()
     assert sensor.response == Logarithm(0.01) and sensor.refractory_period == 3_000_000
     assert sensor.colour_filter is not None and resolution.values["model.num_channels"] == 3
     assert resolution.values["datamanager.pair_mode"] == "successor"
@@ -141,7 +144,7 @@ def test_a_flag_stands_and_is_said_to(recording: Path, tmp_path: Path, setting: 
 
 
 def test_what_is_applied_fills_in_what_is_open_and_leaves_the_config_alone(recording: Path):
-    config = copy.deepcopy(enerf.config.pipeline)
+    config = copy.deepcopy(ENERF)
     config.model.max_res, config.datamanager.silent_pairs = 77, 0
     before = copy.deepcopy(config)
     resolution = resolve(config, read_recording(recording))
@@ -152,7 +155,7 @@ def test_what_is_applied_fills_in_what_is_open_and_leaves_the_config_alone(recor
 
 
 def test_two_answers_to_one_question_are_equal_and_can_be_stored(recording: Path):
-    first, second = (resolve(enerf.config.pipeline, read_recording(recording)) for _ in range(2))
+    first, second = (resolve(ENERF, read_recording(recording)) for _ in range(2))
     assert first == second == yaml.load(yaml.dump(first), Loader=yaml.Loader)
 
 

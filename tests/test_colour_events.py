@@ -262,7 +262,7 @@ def test_the_refractory_period_reaches_the_rays_and_the_table(recording: EventRe
     sensor, index = pipeline.model.sensor, index_events(blind)
     events: Any = pipeline.datamanager.next_batch(sensor).events
     assert torch.isin(events.start[~events.silent], index.times).all()
-    blind_for = sensor.blind_after(events.start, events.end)
+    blind_for: Any = sensor.blind_after(events.start, events.end)
     assert ((blind_for == 8_000_000) | (events.start + blind_for == events.end - 1)).all()
     rays = pipeline.datamanager.event_rays(events, sensor)
     later = events.start + torch.where(events.silent, 0, blind_for.long())

@@ -1,0 +1,56 @@
+"""The pipeline's own part: batches to losses, and what Nerfstudio asks of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_runs import set_up, small_config
+
+from enerf_ns.sensor.response import linlog, luma
+
+
+@pytest.fixture(scope="module")
+def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    config = small_config(
+        recording, tmp_path_factory.mktemp("outputs"), data__supervision="events+frames", data__silent_pairs=16
+    )
+    return set_up(config).pipeline
+
+
+def test_losses_of_training_have_gradients_and_those_of_evaluation_have_none(pipeline: Any):
+    _, losses, metrics = pipeline.get_train_loss_dict(0)
+    assert set(metrics) == {"event_correlation", "frame_psnr"} and all(loss.requires_grad for loss in losses.values())
+    _, losses, _ = pipeline.get_eval_loss_dict(0)
+    assert set(losses) == {"event_loss", "no_event_loss", "frame_loss"}
+    assert not any(loss.requires_grad for loss in losses.values()) and pipeline.training
+
+
+def test_the_correlation_of_events_is_that_of_what_is_rendered(pipeline: Any):
+    """With pairs drawn as for training, by a generator of its own, so that it is the same each time."""
+    found = pipeline.event_correlation(300)
+    assert pipeline.event_correlation(300) == found
+    pairs = pipeline.datamanager.pair_sampler.sample(300, torch.Generator().manual_seed(0))
+    levels = []
+    for times in (pairs.start, pairs.end):
+        rays = pipeline.datamanager.event_camera.rays(pairs.pixels, times)
+        pipeline.eval()
+        with torch.no_grad():
+            levels.append(linlog(luma(pipeline.model(rays)["rgb"])))
+        pipeline.train()
+    thresholds = pipeline.model.sensor.contrast_thresholds
+    measured = thresholds[0] * pairs.on - thresholds[1] * pairs.off
+    expected = np.corrcoef((levels[1] - levels[0]).double(), measured.double())[0, 1]
+    assert found == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_config_of_a_pipeline_has_nothing_open_and_the_users_is_as_it_was(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path).resolved().pipeline
+    made = config.setup(device="cpu", test_mode="test")
+    assert config.model.num_channels is None and config.datamanager.dataparser.depth_range is None
+    used = made.config
+    assert used.model.num_channels == 1 and used.datamanager.dataparser.depth_range is not None
+    assert used.model.sensor.contrast_thresholds is not None and used.datamanager.pair_mode == "partner"
