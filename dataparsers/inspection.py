@@ -1,21 +1,16 @@
-"""`enerf inspect`: what a recording holds and what is wrong with it, in the terminal and as a page of pictures."""
+"""What a recording holds and what is wrong with it, as tables and as a page of pictures."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
-import html
 import io
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float64, Int64, UInt8
 from PIL import Image
 from rich.console import Console
@@ -24,10 +19,10 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.depth_range import scene_depth_range
+from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.files import load_image
-from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import (
     EventStatistics,
@@ -38,11 +33,10 @@ from enerf_ns.dataparsers.problems import (
     unusual_rates,
 )
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.scene_box import scene_normalisation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-CONSOLE = Console(width=120)
 
 NUM_INSTANTS = 6
 """At which events are shown, beside the frames of the same times."""
@@ -56,34 +50,16 @@ NAMED_HOT_PIXELS = 8
 BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
 
 
-@dataclass
-class Inspect:
-    """Look at a recording before training: what was found, numbers, problems, and a page of pictures."""
+@dataclass(frozen=True)
+class Instant:
+    """What the page shows of one time; pictures as data URIs."""
 
-    data: Annotated[Path, tyro.conf.Positional]
-    """Folder of the recording. It is only ever read."""
-    output: Path | None = None
-    """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
-    event_camera: Literal["left", "right"] | None = None
-    """Which of TUM-VIE's two event cameras. None: left."""
-
-    def main(self) -> None:
-        data = self.data.expanduser().resolve()
-        output = (self.output or Path(f"inspect-{data.name}.html")).expanduser().resolve()
-        if output.is_dir():
-            raise RecordingError(f"--output {output} is a folder; give the name of an HTML file.")
-        if output.is_relative_to(data):
-            raise RecordingError(
-                f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
-            )
-        if self.event_camera is None:
-            recording = read_recording(data)
-        else:
-            recording = read_recording(data, "tum_vie", event_camera=self.event_camera)
-        inspection = Inspection.of(recording)
-        inspection.print_tables()
-        _write(output, inspection.page())
-        CONSOLE.print(f"Pictures are in {output}", soft_wrap=True, highlight=False, markup=False)
+    time: str
+    """Seconds, with their unit."""
+    events: str
+    frame: str | None = None
+    """None where there are events alone."""
+    frame_name: str = ""
 
 
 @dataclass(frozen=True)
@@ -103,26 +79,24 @@ class Inspection:
         Raises:
             RecordingError: The events cannot be used.
         """
-        from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, depth_range
-
         statistics = event_statistics(recording)
         near_far, unknown = None, []
         try:
-            near_far = depth_range(recording, EventDataParserConfig())
+            near_far = scene_depth_range(recording)
         except UserError as error:
             unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
         return cls(recording, statistics, near_far, find_problems(recording, near_far) + unknown)
 
-    def print_tables(self) -> None:
+    def print_tables(self, console: Console) -> None:
         """What was found, numbers, and problems in red, on the terminal."""
         for title, rows in (("Recording", self.found()), ("Numbers", self.numbers())):
             table = Table(title=title, show_header=False, title_justify="left")
             for name, value in rows.items():
                 table.add_row(name, escape(value))
-            CONSOLE.print(table)
+            console.print(table)
         for note in self.notes():
-            CONSOLE.print(f"[yellow]note: {escape(note)}[/yellow]", highlight=False)
-        CONSOLE.print(problems_table(self.problems))
+            console.print(f"[yellow]note: {escape(note)}[/yellow]", highlight=False)
+        console.print(problems_table(self.problems))
 
     def notes(self) -> list[str]:
         """What was dropped, mended or assumed, one sentence each."""
@@ -144,7 +118,7 @@ class Inspection:
                 depth = ", with depth" if frames.depth_filenames else ""
                 rows[name] = f"{len(frames.times):,}, {_span(frames.times[0], frames.times[-1])}{depth}"
         rows["event camera"] = _camera(recording.camera)
-        frames = recording.frames or recording.blurred_frames
+        frames = self._frames
         if frames is not None:
             rows["frame camera"] = "the same" if frames.camera == recording.camera else _camera(frames.camera)
             rows["extrinsics"] = _extrinsics(recording, frames)
@@ -160,8 +134,6 @@ class Inspection:
 
     def numbers(self) -> dict[str, str]:
         """What was counted and measured, by name."""
-        from enerf_ns.dataparsers.event_dataparser import scene_normalisation
-
         recording, statistics = self.recording, self.statistics
         gaps = pose_gaps(recording, statistics)
         missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
@@ -198,20 +170,29 @@ class Inspection:
         return rows
 
     def page(self) -> str:
-        """One HTML file with all pictures in it."""
-        frames = self.recording.frames or self.recording.blurred_frames
-        return Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8")).substitute(
-            name=html.escape(self.recording.path.name),
-            path=html.escape(str(self.recording.path)),
-            problems=_problem_box(self.problems),
-            found=_html_table(self.found(), self.notes()),
-            numbers=_html_table(self.numbers()),
-            timeline=_plot(self.timeline(), "events, frames and poses, and the event rate over time"),
-            instants_title="Events" if frames is None else "Frames, and events at the same time, undistorted",
-            instants_width="300px" if frames is None else "420px",
-            instants=self._instants(frames),
-            trajectory=_plot(self.trajectory(), "trajectory with frusta, seen from above"),
-            heat_map=_plot(self.heat_map(), "number of events of each pixel"),
+        """One HTML file with all pictures in it, which loads nothing."""
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+        templates = Environment(
+            loader=FileSystemLoader(Path(__file__).parent),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        return templates.get_template("inspection.html").render(
+            name=self.recording.path.name,
+            path=self.recording.path,
+            problems=self.problems,
+            tables=[
+                ("What was found", self.found(), self.notes()),
+                ("In numbers", self.numbers(), []),
+            ],
+            has_frames=self._frames is not None,
+            timeline=_plot(self.timeline()),
+            instants=self._instants(),
+            trajectory=_plot(self.trajectory()),
+            heat_map=_plot(self.heat_map()),
         )
 
     def timeline(self) -> Figure:
@@ -223,7 +204,7 @@ class Inspection:
         figure = Figure(figsize=(11.4, 4.2), layout="constrained", dpi=150)
         coverage, rate = figure.subplots(2, 1, sharex=True, height_ratios=[1, 2.6])
         coverage.barh(2, edges[-1] - edges[0], left=edges[0], height=0.55, color=BLUE)
-        frames = recording.frames or recording.blurred_frames
+        frames = self._frames
         if frames is not None:
             coverage.vlines(frames.times * 1e-9, 0.72, 1.28, color=GREEN, linewidth=0.8)
         else:
@@ -253,8 +234,6 @@ class Inspection:
     def trajectory(self) -> Figure:
         """The path, the view of some cameras and the box, along the mean up direction of the cameras."""
         from matplotlib.figure import Figure
-
-        from enerf_ns.dataparsers.event_dataparser import scene_normalisation
 
         transform, scale, box = scene_normalisation(self.recording, *(self.depth_range or (1.0, 2.0)))
         from_above = transform[:2, :3]
@@ -315,24 +294,30 @@ class Inspection:
             poses[(times > begin) & (times < end)] = np.nan
         return times, poses
 
-    def _instants(self, frames: Frames | None) -> str:
+    @property
+    def _frames(self) -> Frames | None:
+        return self.recording.frames or self.recording.blurred_frames
+
+    def _instants(self) -> list[Instant]:
         first, last = self.statistics.edges[[0, -1]]
+        frames = self._frames
         during = np.flatnonzero((frames.times >= first) & (frames.times <= last)) if frames is not None else []
         if frames is None or not len(during):
             times = np.linspace(first, last, NUM_INSTANTS + 2)[1:-1].astype(np.int64)
-            return "".join(self._instant(int(time)) for time in times)
-        chosen = np.unique(np.linspace(0, len(during) - 1, NUM_INSTANTS + 2)[1:-1].round().astype(int))
-        return "".join(self._instant(int(frames.times[i]), frames.filenames[i], frames.camera) for i in during[chosen])
+            return [Instant(_seconds(time), self._events_at(time)) for time in times]
+        chosen = during[np.unique(np.linspace(0, len(during) - 1, NUM_INSTANTS + 2)[1:-1].round().astype(int))]
+        return [
+            Instant(
+                _seconds(frames.times[i]),
+                self._events_at(frames.times[i]),
+                _picture(frames.camera.undistort(load_image(frames.filenames[i])), "JPEG"),
+                frames.filenames[i].name,
+            )
+            for i in chosen
+        ]
 
-    def _instant(self, time: int, frame: Path | None = None, camera: Camera | None = None) -> str:
-        pictures = []
-        caption = f"{time * 1e-9:.3f} s"
-        if frame is not None and camera is not None:
-            pictures.append(_image(camera.undistort(load_image(frame)), "JPEG", f"frame at {caption}"))
-        events = event_picture(index_events(self.recording), self.recording.camera, time)
-        pictures.append(_image(events, "PNG", f"events at {caption}"))
-        name = f", {html.escape(frame.name)}" if frame else ""
-        return f'<figure><div class="pair">{"".join(pictures)}</div><figcaption>{caption}{name}</figcaption></figure>'
+    def _events_at(self, time: int) -> str:
+        return _picture(event_picture(index_events(self.recording), self.recording.camera, int(time)), "PNG")
 
 
 def problems_table(problems: list[Problem]) -> Table | str:
@@ -352,8 +337,12 @@ def _round(number: float) -> str:
     return f"{float(f'{number:.3g}'):,.0f}"
 
 
+def _seconds(time: int) -> str:
+    return f"{time * 1e-9:.3f} s"
+
+
 def _span(first: int, last: int) -> str:
-    return f"{first * 1e-9:.3f} s to {last * 1e-9:.3f} s"
+    return f"{_seconds(first)} to {_seconds(last)}"
 
 
 def _camera(camera: Camera) -> str:
@@ -387,47 +376,20 @@ def _rectangle(low: np.ndarray, high: np.ndarray):
     return Rectangle(tuple(low), *(high - low), fill=False, linestyle="--", edgecolor=GREY)
 
 
-def _problem_box(problems: list[Problem]) -> str:
-    if not problems:
-        return '<section class="good">No problems were found.</section>'
-    items = "".join(f"<li><b>{html.escape(p.what)}</b><br>{html.escape(p.advice)}</li>" for p in problems)
-    title = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-    return f'<section class="bad"><h2>{title}</h2><ul>{items}</ul></section>'
-
-
-def _html_table(rows: dict[str, str], notes: list[str] | None = None) -> str:
-    cells = [f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>" for name, value in rows.items()]
-    cells += [f'<tr class="note"><th class="note">note</th><td>{html.escape(note)}</td></tr>' for note in notes or []]
-    return f"<table>{''.join(cells)}</table>"
-
-
-def _plot(figure: Figure, alt: str) -> str:
+def _plot(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    return f'<img class="plot" alt="{alt}" src="{_data_uri(buffer, "png")}">'
+    return _data_uri(buffer, "png")
 
 
-def _image(pixels: UInt8[np.ndarray, "height width channels"], format: Literal["PNG", "JPEG"], alt: str) -> str:
+def _picture(pixels: UInt8[np.ndarray, "height width channels"], format: Literal["PNG", "JPEG"]) -> str:
     image = Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
     if image.width > PICTURE_WIDTH:
         image = image.resize((PICTURE_WIDTH, round(image.height * PICTURE_WIDTH / image.width)), Image.Resampling.BOX)
     buffer = io.BytesIO()
     image.save(buffer, format=format)
-    return f'<img alt="{alt}" src="{_data_uri(buffer, format.lower())}">'
+    return _data_uri(buffer, format.lower())
 
 
 def _data_uri(buffer: io.BytesIO, format: str) -> str:
     return f"data:image/{format};base64,{base64.b64encode(buffer.getvalue()).decode()}"
-
-
-def _write(path: Path, text: str) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise RecordingError(f"--output {path} could not be written ({error.strerror}); give another file.") from error

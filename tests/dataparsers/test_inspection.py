@@ -1,4 +1,4 @@
-"""`enerf inspect`: its tables, and its page of pictures."""
+"""Tables and the page of pictures of a recording."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Literal
@@ -21,15 +22,13 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.inspection import Inspection
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.scripts import inspect
-from enerf_ns.scripts.inspect import Inspect, Inspection
 from enerf_ns.scripts.simulate import Simulate
 
 VOID = {"meta", "img", "br"}
@@ -71,9 +70,8 @@ class Page(HTMLParser):
         return np.asarray(Image.open(io.BytesIO(found)))
 
 
-def page_of(folder: Path, output: Path) -> Page:
-    Inspect(folder, output).main()
-    return Page(output.read_text(encoding="utf-8"))
+def page_of(folder: Path) -> Page:
+    return Page(Inspection.of(read_recording(folder)).page())
 
 
 def as_jpeg(pixels: np.ndarray) -> np.ndarray:
@@ -88,7 +86,7 @@ def seconds(time: int) -> str:
 
 def test_the_page_shows_each_frame_beside_the_events_of_its_time_both_undistorted(tmp_path: Path):
     folder = write_davis(tmp_path / "davis")
-    page = page_of(folder, tmp_path / "page.html")
+    page = page_of(folder)
     recording = read_recording(folder)
     assert recording.camera.model == "radtan"
     names = [name for name, _ in page.images]
@@ -105,87 +103,81 @@ def test_the_page_shows_each_frame_beside_the_events_of_its_time_both_undistorte
     assert all(name in " ".join(names) for name in ("event rate over time", "seen from above", "each pixel"))
 
 
-def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path):
+def test_the_page_loads_nothing(tmp_path: Path):
     folder = write_esim(tmp_path / "esim", frames=("images", "images_corrupted"), channels=3)
-    output = tmp_path / "new" / "page.html"
-    page = page_of(folder, output)
+    text = Inspection.of(read_recording(folder)).page()
+    page = Page(text)
     assert all(reference.startswith("data:") for reference in page.references)
-    without_pictures = re.sub(r'"data:[^"]*"', "", output.read_text(encoding="utf-8"))
+    without_pictures = re.sub(r'"data:[^"]*"', "", text)
     assert not re.search(r"https?:|//|url\(|@import|<script|<link", without_pictures.replace("</", ""))
-    assert [path.name for path in output.parent.iterdir()] == ["page.html"]
     assert page.picture(f"frame at {seconds(FRAME_TIMES[0])}").shape == (HEIGHT, WIDTH, 3)
 
 
+def test_names_are_text_and_never_tags(tmp_path: Path):
+    folder = write_esim(tmp_path / "a<b> & [c]")
+    text = Inspection.of(read_recording(folder)).page()
+    assert "a<b>" not in text and html.escape(str(folder)) in text
+    assert Page(text).text.count("a<b> & [c]") >= 2
+
+
 def test_without_frames_events_are_shown_alone(tmp_path: Path):
-    page = page_of(write_esim(tmp_path / "esim", frames=()), tmp_path / "page.html")
+    page = page_of(write_esim(tmp_path / "esim", frames=()))
     pictures = [name for name, _ in page.images if " at " in name]
     assert len(pictures) == 6 and all(name.startswith("events at ") for name in pictures)
 
 
-def test_problems_are_on_the_page_and_red_in_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    folder = write_esim(tmp_path / "esim")
+def shown_in_terminal(inspection: Inspection) -> str:
     shown = io.StringIO()
-    console = Console(file=shown, force_terminal=True, color_system="standard", width=1000)
-    monkeypatch.setattr(inspect, "CONSOLE", console)
-    page = page_of(folder, tmp_path / "page.html")
-    problems = find_problems(read_recording(folder))
+    inspection.print_tables(Console(file=shown, force_terminal=True, color_system="standard", width=1000))
+    return shown.getvalue()
+
+
+def test_problems_are_on_the_page_and_red_in_the_terminal(tmp_path: Path):
+    inspection = Inspection.of(read_recording(write_esim(tmp_path / "esim")))
+    page, shown = Page(inspection.page()), shown_in_terminal(inspection)
+    problems = find_problems(inspection.recording)
     assert len(problems) > 2 and f"{len(problems)} problems" in page.text
     for problem in problems:
         assert problem.what in page.text and problem.advice in page.text
-        assert f"\x1b[31m{problem.what}" in shown.getvalue() and problem.advice in shown.getvalue()
+        assert f"\x1b[31m{problem.what}" in shown and problem.advice in shown
 
 
-def test_no_problems_are_said_to_be_none():
-    assert Page(inspect._problem_box([])).text == "No problems were found."
-    assert "No problems were found." in str(inspect.problems_table([]))
+def test_one_problem_is_not_two(tmp_path: Path):
+    inspection = Inspection.of(read_recording(write_esim(tmp_path / "esim")))
+    page = Page(replace(inspection, problems=inspection.problems[:1]).page())
+    assert "1 problem\n" in page.text and inspection.problems[1].what not in page.text
+
+
+def test_no_problems_are_said_to_be_none(tmp_path: Path):
+    inspection = replace(Inspection.of(read_recording(write_esim(tmp_path / "esim"))), problems=[])
+    assert "No problems were found." in Page(inspection.page()).text
+    assert "No problems were found." in shown_in_terminal(inspection)
 
 
 def test_what_is_unknown_about_depth_is_a_problem_and_not_the_end(tmp_path: Path):
-    page = page_of(write_davis(tmp_path / "davis"), tmp_path / "page.html")
+    page = page_of(write_davis(tmp_path / "davis"))
     assert "depth range of the scene cannot be measured" in page.text and "--depth-range NEAR FAR" in page.text
 
 
-def test_the_default_is_a_page_in_the_current_folder_and_the_recording_stays_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    folder = write_esim(tmp_path / "a<b> & [c]")
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    Inspect(folder).main()
-    (output,) = here.iterdir()
-    assert output.name == "inspect-a<b> & [c].html"
-    text = output.read_text(encoding="utf-8")
-    assert "a<b>" not in text and html.escape(str(folder)) in text
-    assert Page(text).text.count("a<b> & [c]") >= 2
-    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
-
-
-@pytest.mark.parametrize("output", ["esim/page.html", "esim/images/page.html"])
-def test_nothing_is_written_into_the_recording(tmp_path: Path, output: str):
-    folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError, match="never written to"):
-        Inspect(folder, tmp_path / output).main()
-    assert not (tmp_path / output).exists()
-
-
-def test_a_page_that_cannot_be_written_is_said_in_one_sentence(tmp_path: Path):
-    folder = write_esim(tmp_path / "esim")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingError, match=r"^--output .* could not be written \(.*\); give another file\.$"):
-        Inspect(folder, tmp_path / "file" / "page.html").main()
-    with pytest.raises(RecordingError, match="is a folder"):
-        Inspect(folder, tmp_path).main()
-
-
-def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
-    with pytest.raises(RecordingError, match="does not exist"):
-        Inspect(tmp_path / "nowhere", tmp_path / "page.html").main()
-    folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError):
-        Inspect(folder, tmp_path / "page.html", event_camera="right").main()
-    assert not (tmp_path / "page.html").exists()
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ('{"finished":false}', "was stopped before its end"),
+        ('{"note": "\\"finished\\": false", "finished": true}', None),
+        ("{}", None),
+        ("{", "simulation.json cannot be read as JSON"),
+        ("[]", "simulation.json holds a list"),
+    ],
+)
+def test_whether_a_simulation_was_stopped_is_read_and_not_guessed(tmp_path: Path, content: str, what: str | None):
+    folder = write_davis(tmp_path / "davis")
+    before = find_problems(read_recording(folder))
+    (folder / "simulation.json").write_text(content)
+    inspection = Inspection.of(read_recording(folder))
+    found = [problem.what for problem in inspection.problems]
+    assert len(found) == len(before) + 1 + (what is not None), "the depth range is unknown, too"
+    assert what is None or what in found[0]
+    Page(inspection.page())
 
 
 def test_numbers_of_a_small_recording(tmp_path: Path):
@@ -269,9 +261,9 @@ def test_no_path_is_drawn_where_there_are_no_poses():
 
 
 @pytest.mark.slow
-def test_slider_depth_has_no_problems(shared_data: Path, tmp_path: Path):
+def test_slider_depth_has_no_problems(shared_data: Path):
     """Its authors state depths of 0.45 to 2.07 m."""
-    page = page_of(shared_data / "slider_depth", tmp_path / "page.html")
+    page = page_of(shared_data / "slider_depth")
     assert "No problems were found." in page.text
     assert len(page.images) == 2 * 6 + 3
     depths = re.search(r"near and far([\d.]+) m and ([\d.]+) m, measured", page.text)

@@ -1,0 +1,53 @@
+"""`enerf inspect`: what a recording holds and what is wrong with it, in the terminal and as a page of pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from enerf_ns.dataparsers.errors import OutputError
+from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.inspection import Inspection
+
+CONSOLE = Console(width=120)
+
+
+@dataclass
+class Inspect:
+    """Look at a recording before training: what was found, numbers, problems, and a page of pictures."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Folder of the recording. It is only ever read."""
+    output: Path | None = None
+    """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
+    event_camera: Literal["left", "right"] | None = None
+    """Which of TUM-VIE's two event cameras. None: left."""
+
+    def main(self) -> None:
+        data = self.data.expanduser().resolve()
+        output = (self.output or Path(f"inspect-{data.name}.html")).expanduser().resolve()
+        if output.is_dir():
+            raise OutputError(f"--output {output} is a folder; give the name of an HTML file.")
+        if output.is_relative_to(data):
+            raise OutputError(
+                f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
+            )
+        if self.event_camera is None:
+            recording = read_recording(data)
+        else:
+            recording = read_recording(data, "tum_vie", event_camera=self.event_camera)
+        inspection = Inspection.of(recording)
+        inspection.print_tables(CONSOLE)
+        page = inspection.page()
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(output, page)
+        except OSError as error:
+            reason = f"could not be written ({error.strerror})"
+            raise OutputError(f"--output {output} {reason}; give another file.") from error
+        CONSOLE.print(f"Pictures are in {output}", soft_wrap=True, highlight=False, markup=False)
