@@ -8,7 +8,6 @@ training steps alone; scoring stops the clock. Run it on an otherwise idle machi
 
 from __future__ import annotations
 
-import copy
 import json
 import platform
 import time
@@ -16,22 +15,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 import tyro
 
+from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.evaluation.report import side_by_side
+from enerf_ns.evaluation.runs import method_config, set_up
+from enerf_ns.evaluation.scores import mean_scores
+from enerf_ns.evaluation.views import held_out_views
+
 SETTINGS: dict[str, dict[str, Any]] = {
     "events": {},
-    "sharp-frames": {"datamanager.supervision": "frames", "datamanager.dataparser.train_frames": "sharp"},
-    "blurred-frames": {"datamanager.supervision": "frames"},
-    "events+blurred-frames": {"datamanager.supervision": "events+frames"},
-    "successor-pairs": {"datamanager.pair_mode": "successor"},
-    "window-60ms": {"datamanager.pair_mode": "window"},
-    "uniform-samples": {"model.sampling": "uniform", "model.num_samples": 64},
-    "no-silent-pairs": {"datamanager.silent_pairs": 0},
-    "no-distortion-loss": {"model.distortion_loss_weight": 0.0},
-    "view-direction": {"model.view_direction": True},
-    "16-levels-2^19": {"model.num_levels": 16, "model.log2_table_size": 19},
+    "sharp-frames": {
+        "pipeline.datamanager.supervision": "frames",
+        "pipeline.datamanager.dataparser.train_frames": "sharp",
+    },
+    "blurred-frames": {"pipeline.datamanager.supervision": "frames"},
+    "events+blurred-frames": {"pipeline.datamanager.supervision": "events+frames"},
+    "successor-pairs": {"pipeline.datamanager.pair_mode": "successor"},
+    "window-60ms": {"pipeline.datamanager.pair_mode": "window"},
+    "uniform-samples": {"pipeline.model.sampling": "uniform", "pipeline.model.num_samples": 64},
+    "no-silent-pairs": {"pipeline.datamanager.silent_pairs": 0},
+    "no-distortion-loss": {"pipeline.model.distortion_loss_weight": 0.0},
+    "view-direction": {"pipeline.model.view_direction": True},
+    "16-levels-2^19": {"pipeline.model.num_levels": 16, "pipeline.model.log2_table_size": 19},
 }
 """What each setting changes of the method `enerf`."""
 
@@ -66,27 +73,16 @@ class ErrorAgainstTime:
 
     def train(self, name: str) -> list[dict[str, Any]]:
         """Scores of one setting, a row for each time."""
-        from nerfstudio.configs.method_configs import all_methods
-
-        from enerf_ns.enerf_pipeline import view_scores
-        from enerf_ns.scripts.report import save_picture
-
-        config = copy.deepcopy(all_methods["enerf"])
-        for path, value in SETTINGS[name].items():
-            *parents, attribute = path.split(".")
-            owner = config.pipeline
-            for parent in parents:
-                owner = getattr(owner, parent)
-            setattr(owner, attribute, value)
-        config.data = self.data
-        config.output_dir, config.experiment_name, config.timestamp = self.output_dir / "runs", name, "run"
-        config.vis = "tensorboard"
-        torch.manual_seed(self.seed)
-        trainer = config.setup()
-        trainer.setup()
+        config = method_config(
+            "enerf", self.data, self.output_dir / "runs", {**SETTINGS[name], "machine.seed": self.seed}
+        )
+        config.experiment_name, config.timestamp = name, "run"
+        trainer = set_up(config)
+        pipeline = trainer.pipeline
+        assert isinstance(pipeline, EnerfPipeline)
         rows, step, trained = [], 0, 0.0
         for limit in sorted(self.seconds):
-            trainer.pipeline.train()
+            pipeline.train()
             while trained < limit and step < config.max_num_iterations:
                 start = time.perf_counter()
                 trainer.train_iteration(step)
@@ -94,13 +90,12 @@ class ErrorAgainstTime:
                     callback.func(step)
                 trained += time.perf_counter() - start
                 step += 1
-            views, summary = trainer.pipeline.held_out_views()
-            scores = [view_scores(view) for view in views]
-            row = {"setting": name, "seconds": round(trained, 1), "steps": step}
-            row |= {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
+            views, summary = held_out_views(pipeline)
+            row = {"setting": name, "seconds": round(trained, 1), "steps": step, **mean_scores(views)}
             rows.append(row | {"rays_per_second": summary["num_rays_per_sec"]})
             print(rows[-1], flush=True)
-        save_picture(views, trainer.pipeline, self.output_dir / f"{name}.png")
+        picture = side_by_side(views, pipeline.datamanager.eval_dataset.recording)
+        picture.savefig(self.output_dir / f"{name}.png")
         return rows
 
 

@@ -7,7 +7,6 @@ Prints a Markdown table: median milliseconds of `next_train` and of the whole st
 
 from __future__ import annotations
 
-import copy
 import statistics
 import tempfile
 import time
@@ -18,6 +17,8 @@ from typing import Annotated
 
 import torch
 import tyro
+
+from enerf_ns.evaluation.runs import method_config, set_up
 
 
 @dataclass
@@ -32,16 +33,11 @@ class TrainingStep:
     """Steps timed for each."""
 
     def main(self) -> None:
-        from nerfstudio.configs.method_configs import all_methods
-
         print("| event pairs | sample and pose, ms | whole step, ms | share |\n|---|---|---|---|")
         for pairs in self.event_pairs:
             with tempfile.TemporaryDirectory() as folder:
-                config = copy.deepcopy(all_methods["enerf"])
-                config.data, config.output_dir, config.vis = self.data, Path(folder), "tensorboard"
-                config.pipeline.datamanager.event_pairs = pairs
-                trainer = config.setup()
-                trainer.setup()
+                changes = {"pipeline.datamanager.event_pairs": pairs}
+                trainer = set_up(method_config("enerf", self.data, Path(folder), changes))
                 sampling = self.median_ms(lambda trainer=trainer: trainer.pipeline.datamanager.next_train(0))
                 step = self.median_ms(lambda trainer=trainer: trainer.train_iteration(0))
             print(f"| {pairs} | {sampling:.1f} | {step:.0f} | {100 * sampling / step:.1f} % |", flush=True)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from jaxtyping import Float64
 from rich.progress import track
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 GRID_WIDTH = 240  # of the view that votes are cast into, coarse enough for the number of events
@@ -19,6 +23,36 @@ SMALLEST_DISPARITY, LARGEST_DISPARITY = 2.0, 60.0  # of a peak inside the swept 
 MIN_PEAK = 2.5  # of the dispersion of votes, relative to its median over the planes
 MIN_GAIN = 1.5  # relative to the plane at infinity
 MIN_VOTES = 0.1  # a grid pixel
+
+EVENTS_FOR_DEPTH = 4_000_000
+"""Of more events, so many measure the depth of the scene."""
+
+
+def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Nearest and farthest depth in metres: the one stated, the recording's own, or measured from its events.
+
+    Raises:
+        FlagError: What is stated is no range.
+        RecordingError: The events do not show how deep the scene is.
+    """
+    if stated is None:
+        return recording.depth_range or _measured_depth_range(recording)
+    near, far = stated
+    if not 0.0 < near < far < np.inf:
+        raise FlagError(f"{recording.path}: the depth range is {near} to {far} m; expected 0 < near < far")
+    return near, far
+
+
+@cache
+def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
+    """Takes seconds, and is done once for a recording in a process."""
+    events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
+    try:
+        return estimate_depth_range(events, recording.camera, recording.trajectory)
+    except ValueError as error:
+        raise RecordingError(
+            f"{recording.path}: {str(error).rstrip('.')}, with --depth-range NEAR FAR of the data parser (metres)."
+        ) from error
 
 
 def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory) -> tuple[float, float]:

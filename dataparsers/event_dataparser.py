@@ -16,19 +16,15 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.depth_range import estimate_depth_range
-from enerf_ns.dataparsers.errors import RecordingError, exit_with_a_sentence
+from enerf_ns.dataparsers.depth_range import scene_depth_range
+from enerf_ns.dataparsers.errors import exit_with_a_sentence
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.scene_box import scene_normalisation
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
-
-EVENTS_FOR_DEPTH = 4_000_000
-"""Of more events, so many measure the depth of the scene."""
 
 DEFAULT_HELD_OUT_EVERY = 4
 """Of every so many frames one is held out."""
@@ -140,7 +136,7 @@ class EventDataParser(DataParser):
         Raises:
             RecordingError: if the depth of the scene is neither known nor observable.
         """
-        near, far = depth_range(recording, self.config)
+        near, far = scene_depth_range(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
         frames = split_frames(recording, self.config, held_out=split != "train")
 
@@ -169,66 +165,6 @@ class EventDataParser(DataParser):
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
-
-
-def depth_range(recording: EventRecording, config: EventDataParserConfig) -> tuple[float, float]:
-    """Nearest and farthest depth in metres: from the flag, the recording, or its events, in this order.
-
-    Raises:
-        RecordingError: if the flag is no range, or the events do not show how deep the scene is.
-    """
-    chosen = config.depth_range or recording.depth_range
-    if chosen is None:
-        try:
-            events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
-            chosen = estimate_depth_range(events, recording.camera, recording.trajectory)
-        except ValueError as error:
-            raise RecordingError(
-                f"{recording.path}: {str(error).rstrip('.')}, with --depth-range NEAR FAR of the data parser (metres)."
-            ) from error
-    near, far = chosen
-    if not 0.0 < near < far < np.inf:
-        raise RecordingError(f"{recording.path}: the depth range is {near} to {far} m; expected 0 < near < far")
-    return near, far
-
-
-def scene_normalisation(
-    recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Where the scene lies, seen from every pose of the event camera between the nearest and the farthest depth.
-
-    Args:
-        recording: Trajectory and camera.
-        near: Nearest depth in metres.
-        far: Farthest depth in metres.
-        cube: Middle and half side in metres of a cube along the axes of the world, where the scene is known to be.
-
-    Returns:
-        transform (3, 4) and scale, so that a world point p becomes scale * (transform @ [p, 1]): the mean up direction
-        of the cameras turned to +z, the middle of what they see moved to the origin; and the box (2, 3) of what they
-        see, in scene units, whose longest side is 2. Of a cube, the world is not turned.
-    """
-    if cube is not None:
-        return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])
-    trajectory, camera = recording.trajectory, recording.camera
-    times = np.linspace(*recording.span, 100).astype(np.int64)
-    poses = trajectory.poses(torch.from_numpy(times)).numpy()
-    up = -poses[:, :, 1].mean(axis=0)
-    rotation = np.eye(3)
-    if np.linalg.norm(up) > 0.1:
-        rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-
-    rows = np.linspace(0, camera.height - 1, 5).astype(int)
-    columns = np.linspace(0, camera.width - 1, 5).astype(int)
-    directions = camera.pixel_directions()[np.ix_(rows, columns)].reshape(-1, 3)
-    points = np.concatenate([directions * near, directions * far])
-    seen = np.einsum("nij,mj->nmi", poses[:, :, :3], points) + poses[:, None, :, 3]
-    seen = seen.reshape(-1, 3) @ rotation.T
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    middle, half = (low + high) / 2.0, (high - low) / 2.0
-    scale = 1.0 / half.max()
-    transform = np.concatenate([rotation, -middle[:, None]], axis=1)
-    return transform, float(scale), np.stack([-half, half]) * scale
 
 
 def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> Frames:

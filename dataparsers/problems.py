@@ -13,6 +13,8 @@ from jaxtyping import Float64, Int64
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import read_json
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 
@@ -249,7 +251,12 @@ def unusual_rates(
 
 def _unfinished(folder: Path) -> Iterator[Problem]:
     settings = folder / "simulation.json"
-    if settings.is_file() and '"finished": false' in settings.read_text(errors="replace"):
+    try:
+        stopped = settings.is_file() and read_json(settings).get("finished") is False
+    except RecordingError as error:
+        yield Problem(str(error), "Without it nobody knows whether the simulation was stopped before its end.")
+        return
+    if stopped:
         yield Problem(
             "The simulation of this recording was stopped before its end.",
             "Simulate it again into a new folder, or use what there is.",

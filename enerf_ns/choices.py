@@ -9,20 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Protocol, TypeVar
 
+from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError
-from enerf_ns.dataparsers.event_dataparser import (
-    DEFAULT_HELD_OUT_EVERY,
-    EventDataParserConfig,
-    depth_range,
-    scene_normalisation,
-)
+from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig
 from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.paper_selections import preset_named, selections
@@ -315,7 +312,7 @@ class _Resolver:
         name = f"{DATAPARSER}.depth_range"
         box = self.use(f"{DATAPARSER}.box", lambda: None)
         stated = self.use(name, lambda: None)
-        near, far = depth_range(recording, replace(self.parser, depth_range=stated))
+        near, far = scene_depth_range(recording, stated)
         if stated is None:
             self.values[name] = near, far
         _, scale, _ = scene_normalisation(recording, near, far, box)

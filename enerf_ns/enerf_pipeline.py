@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
-import numpy as np
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
-from rich.progress import track
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
@@ -21,8 +16,9 @@ from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import exit_with_a_sentence
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
-from enerf_ns.evaluation.lpips import lpips
-from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
+from enerf_ns.evaluation.metrics import correlation
+from enerf_ns.evaluation.scores import mean_scores
+from enerf_ns.evaluation.views import held_out_views, save_pictures
 from enerf_ns.ffmpeg import make_ffmpeg_available
 from enerf_ns.supervision.event_supervision import brightness_change
 
@@ -58,24 +54,6 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
         self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), **state})
 
 
-@dataclass
-class HeldOutView:
-    """One held-out frame and what the field shows there. Tensors of shape (height, width, channels) on the CPU."""
-
-    recorded: Tensor | None
-    """Frame in [0, 1], three channels; None where the recording has no frames."""
-    rendered: Tensor
-    """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
-    unaligned: Tensor
-    """Render before its brightness was aligned."""
-    depth: Tensor
-    """Rendered depth in metres along the optical axis, one channel."""
-    recorded_depth: Tensor | None
-    """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
-    time: int
-    """Instant in ns."""
-
-
 class EnerfPipeline(VanillaPipeline):
     """Scores held-out frames together, because events fix brightness only up to one scale and offset."""
 
@@ -101,60 +79,6 @@ class EnerfPipeline(VanillaPipeline):
             results = self.get_train_loss_dict(step)
         self.train()
         return results
-
-    @torch.no_grad()
-    def held_out_views(self) -> tuple[list[HeldOutView], dict[str, float]]:
-        """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
-
-        Returns:
-            The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
-            each channel where the sensor has a colour filter; for a recording without frames, the correlation of its
-            events.
-        """
-        self.eval()
-        manager = self.datamanager
-        dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
-        has_frames = dataset.are_frames
-        views: list[HeldOutView] = []
-        start = time.perf_counter()
-        for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
-            data = dataset[index]
-            camera = dataset.cameras[index : index + 1].to(self.device)
-            rays = camera.generate_rays(camera_indices=0, keep_shape=True)
-            outputs = self.model.get_outputs_for_camera_ray_bundle(rays)
-            z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
-            views.append(
-                HeldOutView(
-                    recorded=data["image"][..., :3] if has_frames else None,
-                    rendered=outputs["rgb"].cpu(),
-                    unaligned=outputs["rgb"].cpu(),
-                    depth=z_depth.cpu(),
-                    recorded_depth=data.get("depth"),
-                    time=int(dataset.frames.times[index]),
-                )
-            )
-        seconds = time.perf_counter() - start
-        summary = {
-            "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
-            "fps": len(views) / seconds,
-        }
-        if not has_frames:
-            summary["event_correlation"] = self.event_correlation()
-        elif manager.config.supervision == "events":
-            recorded = [view.recorded for view in views if view.recorded is not None]
-            rendered = [view.rendered for view in views]
-            if dataset.recording.bayer_pattern is None:
-                aligned, fit = align_brightness(rendered, recorded)
-                fits = {"": fit}
-            else:
-                aligned, channel_fits = align_channels(rendered, recorded)
-                fits = dict(zip(("_red", "_green", "_blue"), channel_fits, strict=True))
-            for view, image in zip(views, aligned, strict=True):
-                view.rendered = image
-            for name, (scale, offset) in fits.items():
-                summary |= {f"brightness_scale{name}": scale, f"brightness_offset{name}": offset}
-        self.train()
-        return views, summary
 
     @torch.no_grad()
     def event_correlation(self, num_pairs: int = 8192) -> float:
@@ -184,36 +108,7 @@ class EnerfPipeline(VanillaPipeline):
             output_path: Folder for one picture a frame, recorded beside rendered.
             get_std: Give the standard deviation over the frames too.
         """
-        views, summary = self.held_out_views()
-        scores = [view_scores(view) for view in views]
+        views, summary = held_out_views(self)
         if output_path is not None:
-            output_path.mkdir(parents=True, exist_ok=True)
-            for index, view in enumerate(views):
-                shown = [view.rendered] if view.recorded is None else [view.recorded, view.rendered]
-                picture = torch.cat(shown, dim=1).clamp(0.0, 1.0)
-                Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(
-                    output_path / f"eval_img_{index:04d}.png"
-                )
-        for key in scores[0]:
-            values = [score[key] for score in scores]
-            summary[key] = float(np.mean(values))
-            if get_std:
-                summary[f"{key}_std"] = float(np.std(values))
-        return summary
-
-
-def view_scores(view: HeldOutView) -> dict[str, float]:
-    """Scores of one held-out frame; none where there is no frame.
-
-    The correlation is that of the render as it is, before brightness is aligned.
-    """
-    if view.recorded is None:
-        return {}
-    scores = image_metrics(view.rendered, view.recorded)
-    scores["correlation"] = correlation(view.unaligned, view.recorded)
-    perceptual = lpips(view.rendered, view.recorded)
-    if perceptual is not None:
-        scores["lpips"] = perceptual
-    if view.recorded_depth is not None:
-        scores["depth_rmse"] = depth_rmse(view.depth, view.recorded_depth)
-    return scores
+            save_pictures(views, output_path)
+        return summary | mean_scores(views, get_std)

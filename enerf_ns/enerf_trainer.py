@@ -16,11 +16,11 @@ from rich.table import Table
 
 from enerf_ns.choices import Choice, resolve
 from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
-from enerf_ns.dataparsers.event_dataparser import scene_normalisation
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 
 

@@ -65,3 +65,17 @@ def check_two_steps(config: EnerfTrainerConfig, expected_losses: set[str]) -> An
         moved = (parameter != before[name]).any() or parameter.numel() == 0  # Nerfstudio keeps an empty one
         assert parameter.isfinite().all() and moved, name
     return trainer
+
+
+SMALL: dict[str, Any] = {
+    "max_num_iterations": 2,
+    "timestamp": "run",
+    "machine.device_type": "cpu",
+    "pipeline.datamanager.event_pairs": 64,
+    "pipeline.datamanager.silent_pairs": 0,
+    "pipeline.model.log2_table_size": 12,
+    "pipeline.model.num_levels": 4,
+    "pipeline.model.num_samples": 16,
+    "pipeline.model.num_proposal_samples": 16,
+}
+"""What a run that takes seconds changes of the method, by the names of ns-train's flags."""

@@ -24,6 +24,7 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.evaluation.metrics import align_channels
+from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.sensor.response import inverse_linlog, linlog
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
@@ -200,7 +201,7 @@ def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(rec
         optimizer.step()
     assert pipeline.event_correlation(2048) > 0.85
 
-    views, summary = pipeline.held_out_views()
+    views, summary = held_out_views(pipeline)
     rendered, recorded, aligned = (
         torch.stack([getattr(view, name) for view in views]).double().reshape(-1, 3)
         for name in ("unaligned", "recorded", "rendered")
@@ -217,7 +218,8 @@ def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(rec
         torch.testing.assert_close(aligned[:, channel], expected, rtol=0, atol=1e-6)
     assert not {"brightness_scale", "brightness_offset"} & set(summary)
 
-    recorded, rendered = views[0].recorded, views[0].unaligned
+    recorded: Any = views[0].recorded
+    rendered = views[0].unaligned
     _, images = pipeline.model.get_image_metrics_and_images(
         {"rgb": rendered, "depth": views[0].depth}, {"image": recorded, "is_frame": True}
     )
@@ -230,7 +232,7 @@ def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
     pipeline = make_pipeline(grey)
     assert pipeline.model.config.num_channels == 1
     assert pipeline.model.sensor.colour_filter is None
-    _, summary = pipeline.held_out_views()
+    _, summary = held_out_views(pipeline)
     assert {"brightness_scale", "brightness_offset"} <= set(summary)
 
 

@@ -107,6 +107,6 @@ for point in distribution("enerf-ns").entry_points:
         [point.name, SPECIFICATIONS[point.group]] for point in ENTRY_POINTS
     )
     assert (packages / "enerf_ns" / "py.typed").is_file()
-    assert (packages / "enerf_ns" / "scripts" / "page.html").is_file()
+    assert (packages / "enerf_ns" / "dataparsers" / "inspection.html").is_file()
     enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr

@@ -54,8 +54,8 @@ class Convert:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
         for sentence in sentences:
-            CONSOLE.print(sentence, soft_wrap=True, highlight=False)
-        CONSOLE.print(f"The recording is in {output_dir}", soft_wrap=True, highlight=False)
+            CONSOLE.print(sentence, soft_wrap=True, highlight=False, markup=False)
+        CONSOLE.print(f"The recording is in {output_dir}", soft_wrap=True, highlight=False, markup=False)
 
     def _check(self, source: Path, output_dir: Path) -> None:
         if not source.exists():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import copy
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerfstudio.utils.rich_utils import CONSOLE
+
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.evaluation.report import write_report
+from enerf_ns.evaluation.runs import method_config, train
 from enerf_ns.scripts.simulate import Simulate
 
 
@@ -21,40 +23,20 @@ class Demo:
     """Training steps. None: as many as the method enerf takes."""
 
     def main(self) -> None:
-        from nerfstudio.configs.method_configs import all_methods
-        from nerfstudio.scripts.train import train_loop
-        from nerfstudio.utils.eval_utils import eval_setup
-        from nerfstudio.utils.rich_utils import CONSOLE
-
-        from enerf_ns.enerf_pipeline import EnerfPipeline
-        from enerf_ns.scripts.report import render_video, write_scores_and_picture
-
         output_dir = self.output_dir.expanduser().resolve()
         recording = output_dir / "recording"
         if recording.exists():
-            CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.")
+            CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.", markup=False)
         else:
             Simulate(recording, "shapes").main()
 
-        config = copy.deepcopy(all_methods["enerf"])
-        config.data = config.pipeline.datamanager.data = recording
-        config.output_dir = output_dir / "runs"
-        config.vis = "tensorboard"
+        config = method_config("enerf", recording, output_dir / "runs")
         config.steps_per_eval_image = config.steps_per_eval_batch
         if self.max_num_iterations is not None:
             config.max_num_iterations = self.max_num_iterations
-        config.set_timestamp()
-        config.save_config()
-        start = time.perf_counter()
-        train_loop(local_rank=0, world_size=1, config=config)
-        train_seconds = time.perf_counter() - start
-
-        run_config = config.get_base_dir() / "config.yml"
-        _, pipeline, _, _ = eval_setup(run_config)
-        assert isinstance(pipeline, EnerfPipeline)
-        events = len(index_events(pipeline.datamanager.train_dataset.recording))
-        extra = {"train_seconds": round(train_seconds, 1), "events": events}
-        scores = write_scores_and_picture(pipeline, output_dir, extra)
-        render_video(pipeline, run_config, output_dir)
+        run = train(config)
+        assert run.train_seconds is not None
+        events = len(index_events(run.pipeline.datamanager.train_dataset.recording))
+        scores = write_report(run, output_dir, {"train_seconds": round(run.train_seconds, 1), "events": events})
         CONSOLE.print(scores)
-        CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir}")
+        CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir}", markup=False)

@@ -4,6 +4,7 @@ time: scenes made from a seed, meshes, folders of images, videos, trained runs."
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -200,16 +201,18 @@ class Simulate:
         if not writer.num_events:
             notes.append("There are no events, without which a recording cannot be read; let more change.")
         for note in [*notes, *writer.notes]:
-            CONSOLE.print(f"note: {note}", highlight=False)
+            CONSOLE.print(f"note: {note}", highlight=False, markup=False)
         CONSOLE.print(
             f"{writer.num_events:,} events and {writer.num_frames} frames of {(view.end - view.start) * 1e-9:g} s are "
             f"in {output_dir}",
             soft_wrap=True,
             highlight=False,
+            markup=False,
         )
         if view.trajectory is not None and writer.num_events:
             for what, command in (("look at it", "enerf inspect"), ("train", "ns-train enerf --data")):
-                CONSOLE.print(f"{what}: {command} {output_dir}", soft_wrap=True, highlight=False)
+                line = f"{what}: {command} {shlex.quote(str(output_dir))}"
+                CONSOLE.print(line, soft_wrap=True, highlight=False, markup=False)
 
     def _check_flags(self) -> None:
         for flag, value, fine, expected in (

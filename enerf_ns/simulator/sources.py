@@ -21,6 +21,7 @@ from enerf_ns.dataparsers.files import image_size, load_image
 from enerf_ns.dataparsers.formats.text_tables import read_times
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.evaluation.runs import load_any_method
 
 if TYPE_CHECKING:
     from enerf_ns.simulator.scene.render import Renderer
@@ -280,7 +281,7 @@ class TrainedRun:
     def __init__(
         self, config: Path, trajectory: Trajectory | None = None, duration: int = 10**9, camera: Camera | None = None
     ):
-        pipeline = _load_run(config)
+        pipeline: Any = load_any_method(config, "inference")[1]
         from nerfstudio.models.splatfacto import SplatfactoModel
 
         self.config = config
@@ -399,21 +400,3 @@ def _camera(camera: Any) -> Camera:
     """Of a camera of Nerfstudio, without its distortion."""
     fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
     return Camera(int(camera.width), int(camera.height), fx, fy, cx - 0.5, cy - 0.5)
-
-
-def _load_run(config: Path) -> Any:
-    """Nerfstudio's pipeline of a trained run."""
-    if not config.is_file():
-        raise RecordingError(f"{config} does not exist; give the config.yml of a trained run.")
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    try:
-        return eval_setup(config, test_mode="inference")[1]
-    except (Exception, SystemExit) as error:  # whatever of a run is missing or of another version
-        reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
-        if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):
-            reason = "its checkpoints are not found"  # the folder is empty or missing, which Nerfstudio only prints
-        raise RecordingError(
-            f"{config} cannot be loaded as a trained run ({reason}); give the config.yml that training wrote, in the "
-            "folder in which training was started."
-        ) from error

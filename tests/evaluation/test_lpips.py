@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
 import torch
+import torchmetrics
 from torch.nn.functional import conv2d, max_pool2d, relu
-from torchmetrics.functional.image.lpips import _LPIPS
 
 from enerf_ns.evaluation.lpips import WEIGHTS_VARIABLE, load_lpips, lpips
 
@@ -42,7 +43,8 @@ def test_distance_grows_with_noise_from_zero(weights):
 
 def test_distance_equals_the_definition_written_out(weights):
     """Zhang et al., CVPR 2018, equation 1, with AlexNet's five layers and the linear heads that torchmetrics brings."""
-    heads = _LPIPS(net="alex", pnet_rand=True)
+    folder = Path(torchmetrics.__file__).parent / "functional" / "image" / "lpips_models"
+    heads = torch.load(folder / "alex.pth", map_location="cpu", weights_only=True)
     shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
@@ -59,10 +61,33 @@ def test_distance_equals_the_definition_written_out(weights):
     expected = 0.0
     with torch.no_grad():
         for i, (one, other) in enumerate(zip(features(distorted), features(IMAGE), strict=True)):
-            head = getattr(heads, f"lin{i}").model[-1].weight
-            expected += conv2d((one - other) ** 2, head).mean().item()
+            expected += conv2d((one - other) ** 2, heads[f"lin{i}.model.1.weight"]).mean().item()
     assert expected > 0.01
     assert lpips(distorted, IMAGE) == pytest.approx(expected, rel=1e-4)
+
+
+def test_weights_from_a_file_download_nothing_and_leave_the_folder_of_downloads_as_it_is(
+    weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    before = torch.hub.get_dir()
+    torch.hub.set_dir(tmp_path)
+    monkeypatch.setattr("urllib.request.urlopen", lambda *_, **__: pytest.fail("a download"))
+    try:
+        assert lpips(IMAGE, IMAGE) == 0.0
+        assert torch.hub.get_dir() == str(tmp_path) and not list(tmp_path.iterdir())
+    finally:
+        torch.hub.set_dir(before)
+
+
+def test_distances_do_not_depend_on_those_before(weights):
+    first = lpips(noisy(IMAGE, 0.1), IMAGE)
+    lpips(noisy(IMAGE, 0.5), IMAGE)
+    assert lpips(noisy(IMAGE, 0.1), IMAGE) == first
+
+
+def test_a_render_that_is_no_number_has_none(weights):
+    assert math.isnan(lpips(IMAGE * torch.nan, IMAGE))  # type: ignore[arg-type]
+    assert lpips(IMAGE + 1e-6, IMAGE + 1e-6) == 0.0, "a rounding error beyond 1 is none"
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no weights"])

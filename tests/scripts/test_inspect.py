@@ -1,148 +1,24 @@
-"""`enerf inspect`: its tables, and its page of pictures."""
+"""`enerf inspect`: where its page goes, and what it refuses."""
 
 from __future__ import annotations
 
-import base64
+import errno
 import html
-import io
-import re
-from html.parser import HTMLParser
 from pathlib import Path
-from typing import Literal
 
-import cv2
-import numpy as np
 import pytest
-import torch
-from PIL import Image
-from recordings import FRAME_TIMES, HEIGHT, WIDTH, image, poses, write_davis, write_esim
-from rich.console import Console
-from scipy.spatial.distance import pdist
-from scipy.spatial.transform import Rotation
+from recordings import write_esim
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.event_index import event_picture
-from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.problems import find_problems
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.scripts import inspect
-from enerf_ns.scripts.inspect import Inspect, Inspection
-from enerf_ns.scripts.simulate import Simulate
-
-VOID = {"meta", "img", "br"}
+from enerf_ns.dataparsers.errors import OutputError, RecordingError
+from enerf_ns.scripts.inspect import Inspect
 
 
-class Page(HTMLParser):
-    """What a page holds; fails where a tag is not closed."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.open: list[str] = []
-        self.images: list[tuple[str, bytes]] = []
-        self.text = ""
-        self.references: list[str] = []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = dict(attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-        self.references += [
-            values[name] or "" for name in ("src", "href", "srcset", "data", "action") if name in values
-        ]
-        if tag == "img":
-            coded = re.fullmatch(r"data:image/(?:png|jpeg);base64,([A-Za-z0-9+/=]+)", values["src"] or "")
-            assert coded, "an image that is not within the page"
-            self.images.append((values["alt"] or "", base64.b64decode(coded[1])))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def picture(self, name: str) -> np.ndarray:
-        (found,) = (content for alt, content in self.images if alt == name)
-        return np.asarray(Image.open(io.BytesIO(found)))
-
-
-def page_of(folder: Path, output: Path) -> Page:
-    Inspect(folder, output).main()
-    return Page(output.read_text(encoding="utf-8"))
-
-
-def as_jpeg(pixels: np.ndarray) -> np.ndarray:
-    coded = io.BytesIO()
-    Image.fromarray(pixels).save(coded, format="JPEG")
-    return np.asarray(Image.open(coded))
-
-
-def seconds(time: int) -> str:
-    return f"{time * 1e-9:.3f} s"
-
-
-def test_the_page_shows_each_frame_beside_the_events_of_its_time_both_undistorted(tmp_path: Path):
-    folder = write_davis(tmp_path / "davis")
-    page = page_of(folder, tmp_path / "page.html")
-    recording = read_recording(folder)
-    assert recording.camera.model == "radtan"
-    names = [name for name, _ in page.images]
-    for i, time in enumerate(FRAME_TIMES.tolist()):
-        assert names.index(f"events at {seconds(time)}") == names.index(f"frame at {seconds(time)}") + 1
-        matrix, coefficients = recording.camera.matrix, np.array(recording.camera.distortion)
-        new_matrix = cv2.getOptimalNewCameraMatrix(matrix, coefficients, (WIDTH, HEIGHT), 0.0)[0]
-        expected = cv2.undistort(image(i), matrix, coefficients, newCameraMatrix=new_matrix)
-        np.testing.assert_array_equal(page.picture(f"frame at {seconds(time)}"), as_jpeg(expected))
-        events = event_picture(index_events(recording), recording.camera, time)
-        np.testing.assert_array_equal(page.picture(f"events at {seconds(time)}"), events)
-        assert f"frame_{i:08d}.png" in page.text
-    assert len(page.images) == 2 * len(FRAME_TIMES) + 3
-    assert all(name in " ".join(names) for name in ("event rate over time", "seen from above", "each pixel"))
-
-
-def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path):
+def test_the_page_is_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = write_esim(tmp_path / "esim", frames=("images", "images_corrupted"), channels=3)
     output = tmp_path / "new" / "page.html"
-    page = page_of(folder, output)
-    assert all(reference.startswith("data:") for reference in page.references)
-    without_pictures = re.sub(r'"data:[^"]*"', "", output.read_text(encoding="utf-8"))
-    assert not re.search(r"https?:|//|url\(|@import|<script|<link", without_pictures.replace("</", ""))
+    Inspect(folder, output).main()
     assert [path.name for path in output.parent.iterdir()] == ["page.html"]
-    assert page.picture(f"frame at {seconds(FRAME_TIMES[0])}").shape == (HEIGHT, WIDTH, 3)
-
-
-def test_without_frames_events_are_shown_alone(tmp_path: Path):
-    page = page_of(write_esim(tmp_path / "esim", frames=()), tmp_path / "page.html")
-    pictures = [name for name, _ in page.images if " at " in name]
-    assert len(pictures) == 6 and all(name.startswith("events at ") for name in pictures)
-
-
-def test_problems_are_on_the_page_and_red_in_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    folder = write_esim(tmp_path / "esim")
-    shown = io.StringIO()
-    console = Console(file=shown, force_terminal=True, color_system="standard", width=1000)
-    monkeypatch.setattr(inspect, "CONSOLE", console)
-    page = page_of(folder, tmp_path / "page.html")
-    problems = find_problems(read_recording(folder))
-    assert len(problems) > 2 and f"{len(problems)} problems" in page.text
-    for problem in problems:
-        assert problem.what in page.text and problem.advice in page.text
-        assert f"\x1b[31m{problem.what}" in shown.getvalue() and problem.advice in shown.getvalue()
-
-
-def test_no_problems_are_said_to_be_none():
-    assert Page(inspect._problem_box([])).text == "No problems were found."
-    assert "No problems were found." in str(inspect.problems_table([]))
-
-
-def test_what_is_unknown_about_depth_is_a_problem_and_not_the_end(tmp_path: Path):
-    page = page_of(write_davis(tmp_path / "davis"), tmp_path / "page.html")
-    assert "depth range of the scene cannot be measured" in page.text and "--depth-range NEAR FAR" in page.text
+    assert output.read_text(encoding="utf-8").endswith("</html>")
 
 
 def test_the_default_is_a_page_in_the_current_folder_and_the_recording_stays_as_it_is(
@@ -156,16 +32,14 @@ def test_the_default_is_a_page_in_the_current_folder_and_the_recording_stays_as_
     Inspect(folder).main()
     (output,) = here.iterdir()
     assert output.name == "inspect-a<b> & [c].html"
-    text = output.read_text(encoding="utf-8")
-    assert "a<b>" not in text and html.escape(str(folder)) in text
-    assert Page(text).text.count("a<b> & [c]") >= 2
+    assert html.escape(str(folder)) in output.read_text(encoding="utf-8")
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
 @pytest.mark.parametrize("output", ["esim/page.html", "esim/images/page.html"])
 def test_nothing_is_written_into_the_recording(tmp_path: Path, output: str):
     folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError, match="never written to"):
+    with pytest.raises(OutputError, match="never written to"):
         Inspect(folder, tmp_path / output).main()
     assert not (tmp_path / output).exists()
 
@@ -173,10 +47,23 @@ def test_nothing_is_written_into_the_recording(tmp_path: Path, output: str):
 def test_a_page_that_cannot_be_written_is_said_in_one_sentence(tmp_path: Path):
     folder = write_esim(tmp_path / "esim")
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingError, match=r"^--output .* could not be written \(.*\); give another file\.$"):
+    with pytest.raises(OutputError, match=r"^--output .* could not be written \(.*\); give another file\.$"):
         Inspect(folder, tmp_path / "file" / "page.html").main()
-    with pytest.raises(RecordingError, match="is a folder"):
+    with pytest.raises(OutputError, match="is a folder"):
         Inspect(folder, tmp_path).main()
+
+
+def test_a_full_disk_leaves_the_page_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder, output = write_esim(tmp_path / "esim"), tmp_path / "page.html"
+    output.write_text("before")
+
+    def full(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OutputError, match=r"^--output .* could not be written \(No space left on device\)"):
+        Inspect(folder, output).main()
+    assert output.read_text() == "before" and {path.name for path in tmp_path.iterdir()} == {"esim", "page.html"}
 
 
 def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
@@ -186,104 +73,3 @@ def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
     with pytest.raises(RecordingError):
         Inspect(folder, tmp_path / "page.html", event_camera="right").main()
     assert not (tmp_path / "page.html").exists()
-
-
-def test_numbers_of_a_small_recording(tmp_path: Path):
-    inspection = Inspection.of(read_recording(write_esim(tmp_path / "esim", depth=True)))
-    found, numbers = inspection.found(), inspection.numbers()
-    assert found["format"] == "esim"
-    assert found["events"] == "6, 0.110 s to 0.900 s"
-    assert found["poses"] == "11, 0.000 s to 1.000 s, usually every 100 ms"
-    assert found["frames"] == "3, 0.150 s to 0.750 s, with depth"
-    assert found["event camera"] == "24 x 18, pinhole, sees 62 x 48 degrees"  # 2 atan(12 / 20), 2 atan(9 / 20)
-    assert found["frame camera"] == "the same" and found["thresholds"] == "not stated"
-    assert numbers["event rate"].startswith("8 a second")
-    assert numbers["polarity"] == "66.7 % on, 33.3 % off"
-    assert numbers["implied ratio"].startswith("C_on = 0.5 C_off")
-    assert numbers["a pixel"] == "0.0139 events; 99.5 % of the pixels have fewer than two"
-    assert numbers["path"] == "0.79 m long, spans 0.79 m"
-    assert numbers["near and far"].startswith("0.5 m and 4 m, stated")
-
-
-def two_cameras(frame_trajectory: Trajectory, trajectory: Trajectory) -> EventRecording:
-    """A recording without files, whose frames come from a camera of their own."""
-    generator = np.random.default_rng(0)
-    number = 5000
-    times = np.sort(generator.integers(0, 10**9, number))
-    events = Events(
-        generator.integers(0, 24, number), generator.integers(0, 18, number), times, generator.integers(0, 2, number)
-    )
-    camera = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
-    frames = Frames((Path("0.png"),), np.array([500_000_000]), Camera(48, 36, 40.0, 40.0, 23.5, 17.5), frame_trajectory)
-    return EventRecording(
-        Path("memory"), "test", camera, trajectory, lambda: iter([events]), (), frames=frames, depth_range=(1.0, 3.0)
-    )
-
-
-def path_drawn(inspection: Inspection) -> np.ndarray:
-    """Points of the plot of the trajectory, (n, 2); not a number where nothing is drawn."""
-    offsets = [np.ma.asanyarray(points.get_offsets()) for points in inspection.trajectory().axes[0].collections]
-    (path,) = (points for points in offsets if len(points) > 100)
-    return path.astype(float).filled(np.nan)
-
-
-def test_extrinsics_are_where_the_frame_camera_is_mounted():
-    rows = poses()
-    trajectory = Trajectory(np.arange(11) * 10**8, rows[:, :3], rows[:, 3:])
-    mount = np.eye(4)
-    mount[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.radians(7.0)]).as_matrix()
-    mount[:3, 3] = [0.045, -0.012, 0.003]
-    inspection = Inspection.of(two_cameras(trajectory.of_mounted(mount), trajectory))
-    numbers = re.findall(r"-?[\d.]+", inspection.found()["extrinsics"])
-    np.testing.assert_allclose(np.array(numbers, float), [45.0, -12.0, 3.0, 7.0], atol=0.05)
-
-
-def test_the_path_is_seen_from_above():
-    """On the plane across the cameras' mean up direction, distances are those of the world without the heights."""
-    generator = np.random.default_rng(1)
-    times = np.arange(0, 21) * 50_000_000
-    places = np.cumsum(generator.normal(size=(21, 3)), axis=0)
-    upright = Rotation.from_rotvec(np.linspace(0, 1, 21)[:, None] * [0.0, 0.0, 1.0]) * Rotation.from_matrix(
-        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    )  # x right, z ahead along the world's y, y down along the world's -z
-    tilt = Rotation.from_rotvec([0.3, -0.2, 0.1])
-    trajectory = Trajectory(times, tilt.apply(places), (tilt * upright).as_quat())
-    inspection = Inspection.of(two_cameras(trajectory, trajectory))
-    drawn = path_drawn(inspection)
-    first, last = inspection.statistics.edges[[0, -1]]
-    seen = torch.from_numpy(np.linspace(first, last, len(drawn)).astype(np.int64))
-    world = tilt.inv().apply(trajectory.poses(seen)[:, :, 3].numpy())
-    np.testing.assert_allclose(pdist(drawn), pdist(world[:, :2]), atol=1e-9)
-
-
-def test_no_path_is_drawn_where_there_are_no_poses():
-    rows = poses()
-    times = np.arange(0, 1_000_000_001, 10_000_000)
-    keep = (times < 301_000_000) | (times > 699_000_000)
-    path = np.stack([np.interp(times, np.arange(11) * 10**8, column) for column in rows.T], axis=1)[keep]
-    trajectory = Trajectory(times[keep], path[:, :3], path[:, 3:])
-    inspection = Inspection.of(two_cameras(trajectory, trajectory))
-    hidden = np.isnan(path_drawn(inspection)).any(axis=1)
-    assert 0.38 < hidden.mean() < 0.42
-    assert inspection.numbers()["pose coverage"].endswith("1 gap")
-
-
-@pytest.mark.slow
-def test_slider_depth_has_no_problems(shared_data: Path, tmp_path: Path):
-    """Its authors state depths of 0.45 to 2.07 m."""
-    page = page_of(shared_data / "slider_depth", tmp_path / "page.html")
-    assert "No problems were found." in page.text
-    assert len(page.images) == 2 * 6 + 3
-    depths = re.search(r"near and far([\d.]+) m and ([\d.]+) m, measured", page.text)
-    assert depths and 0.2 < float(depths[1]) < 0.45 and 2.07 < float(depths[2]) < 4.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", ["shapes", "carpet"])
-@pytest.mark.parametrize("motion", ["shake", "spiral"])
-def test_simulated_recordings_have_no_problems(
-    tmp_path: Path, scene: Literal["shapes", "carpet"], motion: Literal["shake", "spiral"]
-):
-    folder = tmp_path / "recording"
-    Simulate(folder, scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60).main()
-    assert find_problems(read_recording(folder)) == []

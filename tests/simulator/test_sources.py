@@ -23,6 +23,7 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, TrainedRun, Video, linear_from_srgb
@@ -311,7 +312,7 @@ def test_a_run_of_this_package_is_rendered_as_its_own_evaluation_does(tmp_path: 
         *("event-data", "--data", "recording", "--depth-range", 0.5, 4, "--held-out-every", 1),
     )
     pipeline: Any = eval_setup(config)[1]
-    views, _ = pipeline.held_out_views()
+    views, _ = held_out_views(pipeline)
     run = TrainedRun(config)
     recording = read_recording(tmp_path / "recording")
     assert (run.width, run.height, run.start) == (WIDTH, HEIGHT, 0)

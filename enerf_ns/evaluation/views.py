@@ -1,0 +1,134 @@
+"""Held-out frames, and what a field shows there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from rich.progress import track
+from torch import Tensor
+
+from enerf_ns.enerf_datamanager import EnerfDataManager
+from enerf_ns.enerf_model import EnerfModel
+from enerf_ns.evaluation.metrics import align_brightness, align_channels
+
+
+class RenderingPipeline(Protocol):
+    """What is asked of a pipeline: those of this package have it all."""
+
+    datamanager: EnerfDataManager
+
+    @property
+    def model(self) -> EnerfModel: ...
+
+    @property
+    def device(self) -> Any: ...
+
+    def event_correlation(self) -> float: ...
+
+    def eval(self) -> Any: ...
+
+    def train(self) -> Any: ...
+
+
+@dataclass
+class HeldOutView:
+    """One held-out frame and what the field shows there. Tensors of shape (height, width, channels) on the CPU."""
+
+    recorded: Tensor | None
+    """Frame in [0, 1], three channels; None where the recording has no frames."""
+    rendered: Tensor
+    """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
+    unaligned: Tensor
+    """Render before its brightness was aligned."""
+    depth: Tensor
+    """Rendered depth in metres along the optical axis, one channel."""
+    recorded_depth: Tensor | None
+    """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
+    time: int
+    """Instant in ns."""
+
+
+@torch.no_grad()
+def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict[str, float]]:
+    """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
+
+    Args:
+        pipeline: With a trained field.
+
+    Returns:
+        The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
+        each channel where the sensor has a colour filter; for a recording without frames, the correlation of its
+        events.
+    """
+    pipeline.eval()
+    manager = pipeline.datamanager
+    dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
+    views: list[HeldOutView] = []
+    start = time.perf_counter()
+    for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
+        data = dataset[index]
+        camera = dataset.cameras[index : index + 1].to(pipeline.device)
+        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+        outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+        z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
+        views.append(
+            HeldOutView(
+                recorded=data["image"][..., :3] if dataset.are_frames else None,
+                rendered=outputs["rgb"].cpu(),
+                unaligned=outputs["rgb"].cpu(),
+                depth=z_depth.cpu(),
+                recorded_depth=data.get("depth"),
+                time=int(dataset.frames.times[index]),
+            )
+        )
+    seconds = time.perf_counter() - start
+    summary = {
+        "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
+        "fps": len(views) / seconds,
+    }
+    if not dataset.are_frames:
+        summary["event_correlation"] = pipeline.event_correlation()
+    elif manager.config.supervision == "events":
+        summary |= _align(views, each_channel=pipeline.model.sensor.colour_filter is not None)
+    pipeline.train()
+    return views, summary
+
+
+def _align(views: Sequence[HeldOutView], each_channel: bool) -> dict[str, float]:
+    """Fits the brightness of all renders at once, in place, and returns scale and offset."""
+    recorded = [view.recorded for view in views if view.recorded is not None]
+    rendered = [view.rendered for view in views]
+    if each_channel:
+        aligned, channel_fits = align_channels(rendered, recorded)
+        fits = dict(zip(("_red", "_green", "_blue"), channel_fits, strict=True))
+    else:
+        aligned, fit = align_brightness(rendered, recorded)
+        fits = {"": fit}
+    for view, image in zip(views, aligned, strict=True):
+        view.rendered = image
+    summary = {}
+    for name, (scale, offset) in fits.items():
+        summary |= {f"brightness_scale{name}": scale, f"brightness_offset{name}": offset}
+    return summary
+
+
+def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
+    """Write one picture a view, eval_img_0000.png and so on: the frame, where there is one, beside the render.
+
+    Args:
+        views: In the order of their numbers.
+        folder: Made if it does not exist.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, view in enumerate(views):
+        shown = [view.rendered] if view.recorded is None else [view.recorded, view.rendered]
+        picture = torch.cat(shown, dim=1).clamp(0.0, 1.0)
+        Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(folder / f"eval_img_{index:04d}.png")

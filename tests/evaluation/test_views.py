@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from enerf_ns.dataparsers.files import load_array, load_image
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.views import HeldOutView, held_out_views, save_pictures
+from enerf_ns.sensor.response import inverse_linlog, linlog
+
+METRES = 2.5
+HELD_OUT = [2, 6, 10]
+"""Of 11 frames, every fourth."""
+
+
+@pytest.fixture
+def shown(run: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A pipeline whose field shows a wall parallel to every picture, brighter to the right and from view to view."""
+    scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    calls = []
+
+    def outputs(rays: Any) -> dict[str, torch.Tensor]:
+        height, width = rays.shape
+        calls.append(rays)
+        brightness = torch.linspace(0.1, 0.5, width).expand(height, width)[..., None] + 0.1 * len(calls)
+        return {
+            "rgb": brightness.expand(-1, -1, 3),
+            "depth": scale * METRES * rays.metadata["directions_norm"],
+            "accumulation": torch.ones(height, width, 1),
+        }
+
+    monkeypatch.setattr(run.pipeline.model, "get_outputs_for_camera_ray_bundle", outputs)
+    return run.pipeline
+
+
+def test_each_held_out_frame_is_seen_once_with_what_was_recorded_there(shown: Any, recording: Path):
+    views, summary = held_out_views(shown)
+    frames = read_recording(recording).frames
+    assert frames is not None and frames.depth_filenames is not None
+    assert [view.time for view in views] == frames.times[HELD_OUT].tolist()
+    for view, number in zip(views, HELD_OUT, strict=True):
+        assert view.recorded is not None and view.recorded_depth is not None
+        expected = load_image(frames.filenames[number]) / 255.0
+        np.testing.assert_allclose(view.recorded.numpy(), expected, atol=1e-6)
+        np.testing.assert_array_equal(view.recorded_depth[..., 0].numpy(), load_array(frames.depth_filenames[number]))
+    assert summary["fps"] > 0
+    assert summary["num_rays_per_sec"] == pytest.approx(summary["fps"] * 32 * 24)
+
+
+def test_depth_is_along_the_optical_axis_and_in_metres(shown: Any):
+    for view in held_out_views(shown)[0]:
+        torch.testing.assert_close(view.depth, torch.full((24, 32, 1), METRES), rtol=1e-5, atol=0)
+
+
+def test_brightness_is_fitted_once_over_all_views(shown: Any):
+    views, summary = held_out_views(shown)
+    x, y = (
+        linlog(torch.stack([getattr(view, name) for view in views]).double()).flatten().numpy()
+        for name in ("unaligned", "recorded")
+    )
+    scale, offset = np.polyfit(x, y, 1)
+    assert summary["brightness_scale"] == pytest.approx(scale, rel=1e-6)
+    assert summary["brightness_offset"] == pytest.approx(offset, rel=1e-6)
+    for view in views:
+        expected = inverse_linlog(scale * linlog(view.unaligned.double()) + offset).clamp(0, 1).float()
+        torch.testing.assert_close(view.rendered, expected, rtol=0, atol=1e-6)
+
+
+def test_brightness_that_frames_fix_is_left_as_it_is(shown: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shown.datamanager.config, "supervision", "frames")
+    views, summary = held_out_views(shown)
+    assert set(summary) == {"num_rays_per_sec", "fps"}
+    for view in views:
+        torch.testing.assert_close(view.rendered, view.unaligned, rtol=0, atol=0)
+
+
+def test_without_frames_there_are_views_with_nothing_recorded(run_without_frames: Run):
+    views, summary = held_out_views(run_without_frames.pipeline)
+    assert len(views) == 3
+    assert all(view.recorded is None and view.recorded_depth is None for view in views)
+    assert set(summary) == {"num_rays_per_sec", "fps", "event_correlation"}
+    assert -1 <= summary["event_correlation"] <= 1
+
+
+def test_pictures_show_the_frame_beside_the_render(tmp_path: Path):
+    generator = torch.Generator().manual_seed(0)
+    recorded, rendered = (torch.rand(4, 5, 3, generator=generator) for _ in range(2))
+    depth = torch.ones(4, 5, 1)
+    views = [
+        HeldOutView(recorded, 2 * rendered - 0.5, rendered, depth, None, 0),
+        HeldOutView(None, rendered, rendered, depth, None, 1),
+    ]
+    save_pictures(views, tmp_path / "new" / "pictures")
+    pictures = [np.asarray(Image.open(file)) for file in sorted((tmp_path / "new" / "pictures").iterdir())]
+    np.testing.assert_array_equal(pictures[0][:, :5], np.rint(255 * recorded.numpy()))
+    np.testing.assert_array_equal(pictures[0][:, 5:], np.rint(255 * (2 * rendered.numpy() - 0.5).clip(0, 1)))
+    np.testing.assert_array_equal(pictures[1], np.rint(255 * rendered.numpy()))
+    assert (tmp_path / "new" / "pictures" / "eval_img_0001.png").is_file()
