@@ -21,7 +21,7 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
-from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
 
 
 @dataclass
@@ -85,6 +85,7 @@ class EnerfTrainer(Trainer):
     """Nerfstudio's trainer, ending with a list of what was made."""
 
     config: EnerfTrainerConfig
+    pipeline: EnerfPipeline
 
     def _after_train(self) -> None:
         super()._after_train()

@@ -86,9 +86,14 @@ def train(config: EnerfTrainerConfig) -> Run:
 
     Args:
         config: Of the run; its time stamp, which names the run's folder, is set unless it is set already.
+
+    Raises:
+        RecordingError: The recording cannot be used; nothing is written then.
+        FlagError: A setting cannot be followed; nothing is written then.
     """
     from nerfstudio.utils import profiler
 
+    config.resolved()
     config.set_timestamp()
     config.save_config()
     start = time.perf_counter()

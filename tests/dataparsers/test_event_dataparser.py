@@ -259,7 +259,7 @@ def test_depth_that_cannot_be_measured_is_an_error_of_one_sentence_that_names_th
 @pytest.mark.parametrize("flag", [(4.0, 0.5), (0.0, 4.0), (1.0, 1.0), (0.5, float("inf")), (float("nan"), 4.0)])
 def test_a_depth_range_that_is_none_is_an_error(tmp_path: Path, flag: tuple[float, float]):
     parser = EventDataParserConfig(data=write_esim(tmp_path / "esim"), depth_range=flag).setup()
-    with pytest.raises(RecordingError, match="depth range"):
+    with pytest.raises(FlagError, match="depth range"):
         parser.outputs(parser.recording(), "train")
 
 

@@ -123,5 +123,5 @@ def test_depth_is_coloured_from_the_nearest_to_the_farthest(run: Run, tmp_path: 
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     assert asked["called"] and asked["load_config"] == run.config_file
     assert asked["output_path"] == tmp_path / "video.mp4"
-    assert asked["depth_near_plane"] == pytest.approx(run.config.pipeline.model.near_plane)
+    assert asked["depth_near_plane"] == pytest.approx(run.pipeline.config.model.near_plane)
     assert asked["depth_far_plane"] == pytest.approx(far * scale) and asked["depth_near_plane"] == near * scale
