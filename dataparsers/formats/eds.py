@@ -24,7 +24,6 @@ Hidalgo-Carrió et al., "Event-aided direct sparse odometry", CVPR 2022.
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -34,8 +33,9 @@ from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, check_rotation
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size
+from enerf_ns.dataparsers.files import check_image_size, of_file, read_json
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.formats.json_values import parse_array
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -51,9 +51,6 @@ STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
 
 OFFSET_TOLERANCE = 2000
 """ns by which the preparation may round a time."""
-
-CHECKED_STEP = 16
-"""Of all rows and columns, one of so many is looked at to see whether a calibration is of a lens."""
 
 KALIBR_MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
 """Kalibr's names of the distortion models, and ours."""
@@ -110,21 +107,18 @@ def read(folder: Path) -> EventRecording:
         rgb_camera, camera, event_from_rgb = _read_camchain(camchain)
     rectify_map_file = folder / "rectify_map_calib0.h5"
     raw_events = not (prepared and rectify_map_file.exists())
-    if raw_events:
-        _check_lens(camera, camchain)
-    else:
+    if not raw_events:
         undistorted = _read_undistorted_camera(folder, 1)
         places = read_rectify_map(rectify_map_file, *SENSOR_SIZE).astype(float)
         directions = (places - undistorted.matrix[:2, 2]) / undistorted.matrix[[0, 1], [0, 1]]
-        camera = replace(undistorted, model="lookup", directions=directions)
+        with of_file(rectify_map_file):
+            camera = replace(undistorted, model="lookup", directions=directions)
     frames = None
     if image_files:
         if image_files[0].parent.name == PREPARED_IMAGES:
             rgb_camera = _read_undistorted_camera(folder, 0)
         for file in image_files:
             check_image_size(file, rgb_camera.width, rgb_camera.height)
-        if rgb_camera.model != "pinhole":
-            _check_lens(rgb_camera, camchain)
         frames = Frames(image_files, image_times - zero, rgb_camera, trajectory.of_mounted(event_from_rgb))
     if frames is not None or raw_events:
         if camchain is None:
@@ -310,16 +304,11 @@ def _kalibr_camera(path: Path, name: str, entry: dict) -> Camera:
         )
     fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", (4,)).tolist()
     width, height = _numbers(path, name, entry, "resolution", (2,)).tolist()
-    if not (fx > 0 and fy > 0 and all(0 < size < 2**16 and size == int(size) for size in (width, height))):
-        raise RecordingError(
-            f"{path} holds focal lengths {fx:g} and {fy:g} and the resolution {width:g} x {height:g} of {name}, but "
-            "all must be above 0 (pixels), and the resolution whole."
-        )
-    camera = Camera(int(width), int(height), fx, fy, cx, cy)
-    if distortion_model == "none":
-        return camera
-    distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
-    return replace(camera, distortion=distortion, model=KALIBR_MODELS[distortion_model])
+    distortion: tuple[float, ...] = ()
+    if distortion_model != "none":
+        distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
+    with of_file(f"{path}, {name},"):
+        return Camera(width, height, fx, fy, cx, cy, distortion, KALIBR_MODELS[distortion_model])
 
 
 def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -336,40 +325,18 @@ def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...
     return values
 
 
-def _check_lens(camera: Camera, camchain: Path | None) -> None:
-    """Whether each pixel, of a few over the whole image, sees one direction."""
-    width, height = camera.width // CHECKED_STEP + 1, camera.height // CHECKED_STEP + 1
-    lens = {name: getattr(camera, name) / CHECKED_STEP for name in ("fx", "fy", "cx", "cy")}
-    try:
-        replace(camera, width=width, height=height, **lens).pixel_directions()
-    except ValueError as error:
-        raise RecordingError(
-            f"{camchain} holds the {camera.model} distortion {camera.distortion}, which fits no lens, since it folds "
-            "the image; calibrate again."
-        ) from error
-
-
 def _read_undistorted_camera(folder: Path, number: int) -> Camera:
     """Of the RGB (0) or the event camera (1) after the preparation."""
     path = folder / "calib_undist_calib0.json"
+    entries = read_json(path).get("intrinsics_undistorted")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["intrinsics_undistorted"]
-        values = [entries[number][key] for key in ("fx", "fy", "cx", "cy")]
-        if len(entries) != 2 or any(isinstance(value, bool) for value in values):
-            raise ValueError("four numbers of each of two cameras were expected")
-        fx, fy, cx, cy = map(float, values)
-    except FileNotFoundError as error:
+        if not isinstance(entries, list) or len(entries) != 2:
+            raise ValueError("two cameras were expected")
+        fx, fy, cx, cy = parse_array([entries[number][key] for key in ("fx", "fy", "cx", "cy")], (4,)).tolist()
+    except (ValueError, LookupError, TypeError) as error:
         raise RecordingError(
-            f"{path} is missing; intrinsics_undistorted of the RGB and the event camera was expected."
-        ) from error
-    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        raise RecordingError(
-            f"{path} cannot be read as JSON with intrinsics_undistorted, fx fy cx cy (pixels) of the RGB and the event "
+            f"{path} holds no intrinsics_undistorted with numbers fx fy cx cy (pixels) of the RGB and the event "
             "camera; prepare the recording again."
         ) from error
-    if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
-        raise RecordingError(
-            f"{path} holds fx {fx:g}, fy {fy:g}, cx {cx:g} and cy {cy:g}, but finite numbers of pixels, and fx and fy "
-            "above 0, were expected."
-        )
-    return Camera(*SENSOR_SIZE, fx, fy, cx, cy)
+    with of_file(path):
+        return Camera(*SENSOR_SIZE, fx, fy, cx, cy)

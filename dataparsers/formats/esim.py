@@ -13,7 +13,6 @@ One camera takes events and frames, without distortion, and stamps are nanosecon
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,8 +20,10 @@ import numpy as np
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, load_array
-from enerf_ns.dataparsers.formats.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.files import load_array, of_file, read_json
+from enerf_ns.dataparsers.formats.frame_folders import read_frames
+from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
+from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
@@ -52,29 +53,30 @@ def read(folder: Path) -> EventRecording:
     simulation_file = folder / "simulation.json"
     contrast_thresholds = None
     if simulation_file.exists():
-        simulation = _read_simulation(simulation_file)
-        contrast_thresholds = _two_positive(simulation_file, simulation, "contrast_thresholds")
-        depth_range = _two_positive(simulation_file, simulation, "depth_range") or depth_range
+        simulation = read_json(simulation_file)
+        contrast_thresholds = _two_numbers(simulation_file, simulation, "contrast_thresholds")
+        depth_range = _two_numbers(simulation_file, simulation, "depth_range") or depth_range
         camera = _simulated_camera(simulation_file, simulation) or camera
 
     frames = _read_frames(folder / "images", camera, trajectory)
     blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory)
     num_rows = [_num_rows(file) for file in event_files]
-    return EventRecording(
-        path=folder,
-        format="esim",
-        camera=camera,
-        trajectory=trajectory,
-        stream_events=lambda: _stream_events(event_files, num_rows),
-        event_files=tuple(event_files),
-        frames=frames,
-        blurred_frames=blurred_frames,
-        contrast_thresholds=contrast_thresholds,
-        depth_range=depth_range,
-        notes=tuple(notes),
-        locate_event=lambda index: _locate(event_files, num_rows, index),
-        num_events=sum(num_rows),
-    )
+    with of_file(simulation_file):
+        return EventRecording(
+            path=folder,
+            format="esim",
+            camera=camera,
+            trajectory=trajectory,
+            stream_events=lambda: _stream_events(event_files, num_rows),
+            event_files=tuple(event_files),
+            frames=frames,
+            blurred_frames=blurred_frames,
+            contrast_thresholds=contrast_thresholds,
+            depth_range=depth_range,
+            notes=tuple(notes),
+            locate_event=lambda index: _locate(event_files, num_rows, index),
+            num_events=sum(num_rows),
+        )
 
 
 def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
@@ -82,34 +84,18 @@ def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
         raise RecordingError(f"{path} holds an array of shape {rows.shape}, but (N, 17) was expected.")
     height, width, focal_length = rows[0, :15].reshape(3, 5)[:, 4].tolist()
-    if not (_is_size(height) and _is_size(width) and 0 < focal_length < np.inf):
-        raise RecordingError(
-            f"{path} holds height {height:g}, width {width:g} and focal length {focal_length:g} in its first row, but "
-            "they must be above 0, and height and width whole pixels."
-        )
-    camera = Camera(int(width), int(height), focal_length, focal_length, width / 2, height / 2)
+    with of_file(path):
+        camera = Camera(width, height, focal_length, focal_length, width / 2, height / 2)
     bounds = rows[:, 15:]
     near, far = float(bounds[:, 0].min()), float(bounds[:, 1].max())
     return camera, (near, far) if 0 < near < far < np.inf else None
 
 
-def _read_simulation(path: Path) -> dict:
-    try:
-        simulation = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} cannot be read as JSON ({error}); simulate it again or remove it.") from error
-    if not isinstance(simulation, dict):
-        raise RecordingError(f"{path} holds a {type(simulation).__name__}, but a JSON object was expected.")
-    return simulation
-
-
-def _two_positive(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
-    value = simulation.get(name)
-    if value is None:
+def _two_numbers(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
+    if simulation.get(name) is None:
         return None
-    if not (isinstance(value, list) and len(value) == 2 and all(_is_positive(number) for number in value)):
-        raise RecordingError(f"{path} holds {name} = {value!r}, but two numbers above 0 were expected.")
-    return float(value[0]), float(value[1])
+    first, second = parse_numbers(path, name, simulation[name], (2,), "two numbers").tolist()
+    return first, second
 
 
 def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
@@ -117,46 +103,18 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
     if camera is None:
         return None
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    try:
-        width, height, fx, fy, cx, cy = parse_array([camera[name] for name in names], (6,)).tolist()
-        good = _is_size(width) and _is_size(height) and fx > 0 and fy > 0
-    except (TypeError, KeyError, ValueError):
-        good = False
-    if not good:
-        raise RecordingError(
-            f"{path} holds camera = {camera!r}, but the numbers {', '.join(names)} in pixels were expected."
-        )
-    return Camera(int(width), int(height), fx, fy, cx, cy)
+    if not isinstance(camera, dict):
+        raise RecordingError(f"{path} holds camera = {shown(camera)}, but {', '.join(names)} in pixels were expected.")
+    values = [camera.get(name) for name in names]
+    numbers = parse_numbers(path, f"camera ({', '.join(names)})", values, (6,), "numbers of pixels")
+    with of_file(path):
+        return Camera(*numbers.tolist())
 
 
 def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory) -> Frames | None:
-    files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
-    stamps_file = folder / "image_stamps_ns.txt"
-    if not files and not stamps_file.exists():
-        return None
-    times = read_times(stamps_file, "ns")
-    if len(times) != len(files):
-        raise RecordingError(
-            f"{folder} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; give one each."
-        )
-    for file in files:
-        check_image_size(file, camera.width, camera.height)
-    depth_folder = folder.parent / "depth"
-    depth_files = tuple(sorted(depth_folder.glob("*.npy")))
-    if not depth_files:
-        return Frames(files, times, camera, trajectory)
-    if len(depth_files) != len(files):
-        raise RecordingError(
-            f"{depth_folder} holds {len(depth_files)} depth maps, but {folder} holds {len(files)} images."
-        )
-    for file in depth_files:
-        shape = load_array(file, mmap_mode="r").shape
-        if shape != (camera.height, camera.width):
-            raise RecordingError(
-                f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
-                f"{(camera.height, camera.width)}."
-            )
-    return Frames(files, times, camera, trajectory, depth_files)
+    files = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
+    depth_files = sorted((folder.parent / "depth").glob("*.npy"))
+    return read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
 
 
 def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
@@ -201,11 +159,3 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
             return f"{file}, event {index + 1}"
         index -= length
     return str(files[-1])
-
-
-def _is_positive(number: object) -> bool:
-    return isinstance(number, (int, float)) and not isinstance(number, bool) and 0 < number < 1e9
-
-
-def _is_size(number: float) -> bool:
-    return 0 < number < 2**16 and number == int(number)

@@ -11,14 +11,14 @@ The columns lie in the group events/ or at the root. Rectify maps, which come be
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32
 
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import reading
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Hdf5Events:
     def __init__(self, path: Path):
         self.path = path
         self._cache = SMALLEST_CACHE
-        with _reading(path, "events"), self._open() as file:
+        with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
             self._check(columns)
             self._offset = self._read_offset(file)
@@ -76,14 +76,14 @@ class Hdf5Events:
         Raises:
             RecordingError: The file cannot be read any more, or has fewer events than before.
         """
-        with _reading(self.path, "events"):
+        with reading(self.path, "an HDF5 file with events"):
             file = self._open()
         with file:
-            with _reading(self.path, "events"):
+            with reading(self.path, "an HDF5 file with events"):
                 columns = self._columns(file)
             for start in range(0, self.num_events, EVENTS_AT_A_TIME):
                 stop = min(start + EVENTS_AT_A_TIME, self.num_events)
-                with _reading(self.path, f"events {start + 1:,} to {stop:,}"):
+                with reading(self.path, f"an HDF5 file with events {start + 1:,} to {stop:,}"):
                     x, y, p = (columns[name][start:stop] for name in ("x", "y", "p"))
                     t = self._times(columns["t"], start, stop, zero)
                 if not len(x) == len(y) == len(t) == len(p) == stop - start:
@@ -173,7 +173,7 @@ def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray,
     import h5py
     import hdf5plugin  # noqa: F401  makes the filters known
 
-    with _reading(path, "a rectify map"), h5py.File(path, "r", locking=False) as file:
+    with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
         dataset = file.get("rectify_map")
         if not isinstance(dataset, h5py.Dataset):
             raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
@@ -215,22 +215,3 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
 
 def _chunk_bytes(dataset: h5py.Dataset) -> int:
     return dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
-
-
-@contextmanager
-def _reading(path: Path, what: str) -> Iterator[None]:
-    """Turns errors of the HDF5 library into one sentence about the file."""
-    try:
-        yield
-    except UserError:
-        raise
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path} is missing; an HDF5 file with {what} was expected there.") from error
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
-        if path.is_file() and path.stat().st_size == 0:
-            raise RecordingError(f"{path} is empty; an HDF5 file with {what} was expected.") from error
-        lines = str(error).strip("\"'").splitlines()
-        reason = lines[0].rstrip(".") if lines else type(error).__name__
-        raise RecordingError(
-            f"{path} cannot be read as an HDF5 file with {what} ({reason}); copy it again from its source."
-        ) from error

@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import read_json
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.registry import read_recording
@@ -129,7 +130,7 @@ class Convert:
                 )
             return {"width": file.size[0], "height": file.size[1]}
         path = self.camera.expanduser()
-        camera = event_recording.parse_camera(path, "camera", event_recording.read_json(path))
+        camera = event_recording.parse_camera(path, "camera", read_json(path))
         if file.size not in (None, (camera.width, camera.height)):
             raise RecordingError(
                 f"{path} is the calibration of {camera.width} x {camera.height} pixels, but {file.path} states a "

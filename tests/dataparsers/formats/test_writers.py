@@ -636,7 +636,11 @@ def test_memory_does_not_grow_with_the_events(tmp_path: Path, layout: str):
         ("eds", dict(frame_camera=replace(RGB, distortion=(0.1, 0, 0, 0, 0))), "but one of 5 of radtan was asked for"),
         ("tum_vie", dict(event_camera=RADTAN), "tum_vie holds events of 1280 x 720 pixels"),
         ("tum_vie", dict(frame_camera=RGB), "tum_vie holds cameras of the model fisheye, but one of radtan"),
-        ("event_recording", dict(frame_camera=replace(RGB, model="lookup")), "no table of directions"),
+        (
+            "event_recording",
+            dict(frame_camera=replace(CENTRED, model="lookup", directions=np.zeros((30, 40, 2)))),
+            "no table of directions",
+        ),
         ("event_recording", dict(event_from_frame=np.diag([1.0, 1, -1, 1])), "their rotation is no rotation"),
     ],
 )
