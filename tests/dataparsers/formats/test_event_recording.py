@@ -501,7 +501,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
             (folder / "recording.json").write_text(json.dumps(camera(model="lookup"))),
             np.save(folder / "camera_directions.npy", np.zeros((WIDTH, HEIGHT, 2))),
         ),
-        "camera_directions.npy holds a table of where each pixel of a camera looks of shape (24, 18, 2), but finite numbers of shape (height, width, 2)",
+        "looks of shape (24, 18, 2), but finite numbers of shape (height, width, 2)",
     ),
 }
 
