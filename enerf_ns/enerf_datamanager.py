@@ -16,7 +16,8 @@ from torch import Tensor
 from tyro.conf import OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
-from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_data
+from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.event_dataset import EventDataset
@@ -24,9 +25,12 @@ from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
 from enerf_ns.ray_samplers import PairedRayBundle
 from enerf_ns.sensor.response import colour_channels
 
+DATAPARSERS = {name: config for name, config in all_dataparsers.items() if isinstance(config, EventDataParserConfig)}
 EventDataParserUnion = OmitSubcommandPrefixes[
     subcommand_type_from_defaults(
-        {name: config for name, config in all_dataparsers.items() if isinstance(config, EventDataParserConfig)},
+        DATAPARSERS,
+        {format.command: format.description for format in formats() if format.command in DATAPARSERS}
+        | {"event-data": event_data.description or ""},
         prefix_names=False,
     )
 ]

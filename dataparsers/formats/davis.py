@@ -20,6 +20,7 @@ from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import check_image_size, image_size, of_file
+from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -225,3 +226,12 @@ def _parse_lines(text, t, x, y, p):
             i += 1
         i += 1
     return len(t)
+
+
+FORMAT = Format(
+    name="davis",
+    command="davis-events",
+    description="Events in the text format of the UZH event-camera dataset.",
+    files=FILES,
+    read=read,
+)

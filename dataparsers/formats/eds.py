@@ -1,4 +1,4 @@
-"""Reader for EDS, as it is unpacked and as E-NeRF's reference code prepares it.
+"""Reader of EDS, as it is unpacked and as E-NeRF's reference code prepares it, and writer of the former.
 
 As unpacked, on a clock of absolute times:
 
@@ -27,17 +27,20 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, check_rotation
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, of_file, read_json
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.json_values import parse_array
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
@@ -48,6 +51,9 @@ SENSOR_SIZE = (640, 480)
 RAW_POSES, PREPARED_POSES = "stamped_groundtruth.txt", "stamped_groundtruth_us.txt"
 RAW_IMAGES, PREPARED_IMAGES = "images", "images_undistorted_calib0"
 STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
+
+CLOCK_START = 1000 * 10**9
+"""What the clock of a recording that is written shows (ns) when the simulation's is at 0."""
 
 OFFSET_TOLERANCE = 2000
 """ns by which the preparation may round a time."""
@@ -340,3 +346,84 @@ def _read_undistorted_camera(folder: Path, number: int) -> Camera:
         ) from error
     with of_file(path):
         return Camera(*SENSOR_SIZE, fx, fy, cx, cy)
+
+
+class EdsWriter(Writer):
+    """EDS as it is unpacked. The published files do not state exposures; simulation.json does."""
+
+    layout = "eds"
+    start = CLOCK_START
+    published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA, PUBLISHED_EXTRINSICS)
+
+    def add_events(self, events: Events) -> None:
+        """As of `Writer.add_events`, up to 1 µs before the last frame, since E-NeRF's loader wants that to be last."""
+        until = int(np.searchsorted(events.t, self.setup.frame_times[-1] - 1000))
+        super().add_events(Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until]))
+
+    def _check(self) -> None:
+        self._check_size(SENSOR_SIZE)
+        for camera in (self.setup.event_camera, self.setup.frame_camera):
+            if camera.model == "lookup" or (camera.model == "radtan" and len(camera.distortion) != 4):
+                raise FlagError(
+                    f"The layout eds holds cameras without distortion, or with 4 coefficients of it (radtan or "
+                    f"fisheye), but one of {len(camera.distortion)} of {camera.model} was asked for; choose another."
+                )
+
+    def _write_calibration(self) -> None:
+        setup = self.setup
+        rgb = _kalibr(setup.frame_camera, "/cam0/image_raw", 1)
+        event = _kalibr(setup.event_camera, "/cam1/events", 0)
+        event["T_cn_cnm1"] = setup.event_from_frame.tolist()
+        content = f"cam0: # This is the RGB camera\n{_yaml(rgb)}cam1: # This is the event camera\n{_yaml(event)}"
+        self._replace("camchain.yaml", content.encode())
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        times = (trajectory.times + CLOCK_START).tolist()
+        stamps = [f"{time // 10**9}.{time % 10**9:09d}" for time in times]
+        header = "# timestamp[s] px py pz qx qy qz qw"
+        content = encode_poses(header, stamps, trajectory.positions, trajectory.quaternions)
+        self._replace(RAW_POSES, content)
+
+    def _open_events(self) -> EventFiles:
+        return Hdf5EventsFile(
+            self.folder / "events.h5", "", {}, lambda times: self._to_us(times) + CLOCK_START // 1000, self.events_held
+        )
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        path = f"{RAW_IMAGES}/frame_{number:010d}.png"
+        if blurred is None:
+            return {path: in_colour(sharp)}
+        return {path: in_colour(blurred), f"sharp_images/{self._name(number)}.png": in_colour(sharp)}
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        return {"images_timestamps.txt": f"{int(self._to_us(np.array(time))) + CLOCK_START // 1000}\n"}
+
+
+def _yaml(value: dict) -> str:
+    import yaml
+
+    text = yaml.safe_dump(value, default_flow_style=None)
+    return "".join(f"  {line}\n" for line in text.splitlines())
+
+
+def _kalibr(camera: Camera, topic: str, other: int) -> dict[str, Any]:
+    models = {ours: kalibrs for kalibrs, ours in KALIBR_MODELS.items()}
+    return {
+        "cam_overlaps": [other],
+        "camera_model": "pinhole",
+        "distortion_coeffs": list(map(float, camera.distortion)),
+        "distortion_model": models[camera.model],
+        "intrinsics": list(map(float, (camera.fx, camera.fy, camera.cx, camera.cy))),
+        "resolution": [camera.width, camera.height],
+        "rostopic": topic,
+    }
+
+
+FORMAT = Format(
+    name="eds",
+    command="eds-events",
+    description="Events of EDS, as published or prepared by E-NeRF's reference code.",
+    files=FILES,
+    read=read,
+    writer=EdsWriter,
+)

@@ -1,4 +1,4 @@
-"""Reader for E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
+"""Reader and writer of E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
 
     events/*.npy                (n, 4) x y t_ns p, in time order over the files by name; a fifth column is ignored
     *poses_all*.txt             t_ns px py pz qx qy qz qw after a header line; camera to world, OpenCV axes, metres
@@ -14,20 +14,27 @@ One camera takes events and frames, without distortion, and stamps are nanosecon
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_array, of_file, read_json
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import in_colour, load_array, of_file, read_json
+from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
 from enerf_ns.dataparsers.formats.text_tables import read_poses
+from enerf_ns.dataparsers.formats.writer import EventFiles, GrowingArray, Writer, encode_npy, encode_poses, poses_at
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
+
+FEWEST_POSES = 101
+"""That the reference code of E-NeRF accepts."""
 
 
 def read(folder: Path) -> EventRecording:
@@ -159,3 +166,102 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
             return f"{file}, event {index + 1}"
         index -= length
     return str(files[-1])
+
+
+class EsimWriter(Writer):
+    """E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
+
+    layout = "esim"
+    fewest_frames = 11
+
+    def _check(self) -> None:
+        setup, camera = self.setup, self.setup.event_camera
+        centred = Camera(camera.width, camera.height, camera.fx, camera.fx, camera.width / 2, camera.height / 2)
+        if not (camera == setup.frame_camera == centred and np.allclose(setup.event_from_frame, np.eye(4), atol=1e-12)):
+            raise FlagError(
+                "The layout esim holds one camera for events and frames, without distortion, with one focal length and "
+                "the principal point at (width / 2, height / 2); choose such a camera or another layout."
+            )
+
+    def _write_calibration(self) -> None:
+        self._write_bounds()
+
+    def _write_bounds(self) -> None:
+        """LLFF's rows [R | t | height width focal], axes down, right and back, and the nearest and farthest depth."""
+        camera, trajectory, times = self.setup.event_camera, self.setup.trajectory, self.setup.frame_times
+        poses = np.tile(np.eye(3, 4), (len(times), 1, 1))
+        if trajectory is not None:
+            poses = trajectory.poses(torch.from_numpy(times)).numpy()
+        axes = np.stack([poses[:, :, 1], poses[:, :, 0], -poses[:, :, 2], poses[:, :, 3]], axis=2)
+        sizes = np.tile(np.array([[camera.height], [camera.width], [camera.fx]]), (len(times), 1, 1))
+        rows = np.concatenate([axes, sizes], axis=2).reshape(len(times), 15)
+        bounds = np.tile(self.depth_range or (0.0, 0.0), (len(times), 1))
+        self._replace("poses_bounds.npy", encode_npy(np.column_stack([rows, bounds]), np.float64))
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        """All poses and, where they are too few, some between them, which leave the interpolated path as it is."""
+        times = trajectory.times
+        parts = -(-FEWEST_POSES // (len(times) - 1))
+        if len(times) < FEWEST_POSES:
+            between = [start + (end - start) * np.arange(parts) // parts for start, end in pairwise(times)]
+            times = np.unique(np.append(np.concatenate(between), times[-1]))
+            positions, quaternions = poses_at(trajectory, times)
+        else:
+            positions, quaternions = trajectory.positions, trajectory.quaternions
+        self._replace("poses_all.txt", encode_poses("# t_ns px py pz qx qy qz qw", times, positions, quaternions))
+
+    def _open_events(self) -> EventFiles:
+        paths = [f"events/{self._name(number)}.npy" for number in range(len(self.setup.frame_times))]
+        return IntervalFiles([self.folder / path for path in paths], self.setup.frame_times)
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        images = {f"images/{self._name(number)}.png": in_colour(sharp)}
+        if blurred is not None:
+            images[f"images_corrupted/{self._name(number)}.png"] = in_colour(blurred)
+        return images
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        folders = ("images", "images_corrupted") if self.setup.exposure else ("images",)
+        return {f"{folder}/image_stamps_ns.txt": f"{time}\n" for folder in folders}
+
+    def _write_summary(self, finished: bool) -> None:
+        if self.depth_range is not None:
+            self._write_bounds()
+        super()._write_summary(finished)
+
+
+class IntervalFiles:
+    """One file for each frame, with the events after it up to the next; those before the first are in its file."""
+
+    def __init__(self, paths: list[Path], frame_times: np.ndarray):
+        for path in paths:
+            GrowingArray(path, np.int64, (4,)).close()
+        self._paths, self._ends, self._number = paths, frame_times[1:], 0
+        self._file = GrowingArray(paths[0], np.int64, (4,))
+
+    def append(self, events: Events) -> None:
+        rows = np.column_stack([events.x, events.y, events.t, events.p]).astype(np.int64)
+        while len(rows):
+            count = len(rows)
+            if self._number < len(self._ends):
+                count = int(np.searchsorted(rows[:, 2], self._ends[self._number], side="right"))
+            self._file.append(rows[:count])
+            self._file.commit(self._file.num_rows + count)
+            rows = rows[count:]
+            if len(rows):
+                self._file.close()
+                self._number += 1
+                self._file = GrowingArray(self._paths[self._number], np.int64, (4,))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+FORMAT = Format(
+    name="esim",
+    command="esim-events",
+    description="Events in the folder layout of E-NeRF's ESIM sequences.",
+    files=FILES,
+    read=read,
+    writer=EsimWriter,
+)

@@ -27,6 +27,7 @@ import numpy as np
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import of_file, reading
+from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.robust_enerf import (
     checked_camera,
     checked_trajectory,
@@ -219,3 +220,12 @@ def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
         raise RecordingError(f"{path} holds --{COLOUR}={flags[COLOUR]}, where true or false was expected.")
     on, off, refractory_period = numbers
     return (on, off), whole_nanoseconds(path, refractory_period), "RGGB" if colour else None
+
+
+FORMAT = Format(
+    name="esim_bag",
+    command="esim-bag",
+    description="Events in esim.bag of Robust e-NeRF's simulated sequences.",
+    files=FILES,
+    read=read,
+)

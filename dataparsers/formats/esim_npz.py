@@ -33,6 +33,7 @@ from jaxtyping import Int, Int64
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import of_file, reading
+from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.robust_enerf import (
     LATEST,
     checked_camera,
@@ -227,3 +228,12 @@ def _nanoseconds(path: Path, times: Int[np.ndarray, " times"]) -> Int64[np.ndarr
             "nanoseconds."
         )
     return times.astype(np.int64)
+
+
+FORMAT = Format(
+    name="esim_npz",
+    command="esim-npz",
+    description="Events in the .npz layout of Robust e-NeRF's simulated sequences.",
+    files=FILES,
+    read=read,
+)

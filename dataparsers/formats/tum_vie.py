@@ -1,4 +1,4 @@
-"""Reader for TUM-VIE: two event cameras, two cameras of grey frames, and motion capture.
+"""Reader and writer of TUM-VIE: two event cameras, two cameras of grey frames, and motion capture.
 
 As it is unpacked, for the left event camera; the right one has files of its own:
 
@@ -46,9 +46,10 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import image_size, of_file, read_json
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.formats.format import Format, FormatOptions
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.text_tables import (
     QUATERNION_TOLERANCE,
     parse_numbers,
@@ -56,6 +57,7 @@ from enerf_ns.dataparsers.formats.text_tables import (
     read_rows,
     read_times,
 )
+from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json, encode_poses, poses_at
 from enerf_ns.dataparsers.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
@@ -87,8 +89,8 @@ PUBLISHED_EXTRINSICS = np.array(
 """Pose of the left frame camera in the axes of the left event camera, metres; these three are of camera-calibrationA,
 with which mocap-desk and mocap-desk2 were recorded."""
 
-POSES_PER_SECOND = 120
-"""Of the motion capture."""
+WRITTEN_SEQUENCE = "simulated"
+"""What the files of a recording that is written are named after."""
 
 SEQUENCES = {
     "A": ("loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"),
@@ -109,6 +111,14 @@ LONGEST_GAP = 200_000_000
 
 BALANCE_TOLERANCE = 1.0
 """Pixels by which intrinsics may differ from those that OpenCV gives; its versions differ by less."""
+
+
+@dataclass(frozen=True)
+class TumVieOptions(FormatOptions):
+    """What is read of a recording."""
+
+    event_camera: Literal["left", "right"] = "left"
+    """Which of the two event cameras, with the frame camera beside it."""
 
 
 @dataclass(frozen=True)
@@ -486,3 +496,87 @@ def _read_marker(path: Path, published: str) -> Float64[np.ndarray, "4 4"]:
             f"{path} {found} states no T_imu_marker; replace it by {published}, published with the data set."
         )
     return _pose(path, entry, "T_imu_marker")
+
+
+class TumVieWriter(Writer):
+    """TUM-VIE as it is unpacked: its left cameras. Markers, IMU and event camera are in one place."""
+
+    layout = "tum_vie"
+    poses_per_second = 120
+    published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_FRAME_CAMERA, PUBLISHED_EXTRINSICS)
+
+    def _check(self) -> None:
+        self._check_size(SENSOR_SIZE)
+        for camera in (self.setup.event_camera, self.setup.frame_camera):
+            if camera.model != "fisheye":
+                raise FlagError(
+                    f"The layout tum_vie holds cameras of the model fisheye, but one of {camera.model} was asked for; "
+                    "choose such a camera or another layout."
+                )
+
+    def _write_calibration(self) -> None:
+        setup = self.setup
+        cameras = [setup.frame_camera] * 2 + [setup.event_camera] * 2
+        names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+        lenses = [(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion) for camera in cameras]
+        calibration = {
+            "T_imu_cam": [_pose_json(setup.event_from_frame)] * 2 + [_pose_json(np.eye(4))] * 2,
+            "intrinsics": [
+                {"camera_type": "kb4", "intrinsics": dict(zip(names, lens, strict=True))} for lens in lenses
+            ],
+            "resolution": [[camera.width, camera.height] for camera in cameras],
+        }
+        self._replace("camera-calibrationA.json", encode_json({"value0": calibration}))
+        marker = {"value0": {"T_imu_marker": _pose_json(np.eye(4))}}
+        self._replace("mocap-imu-calibrationA.json", encode_json(marker))
+        self._replace(
+            f"{self._data}/right_images/image_timestamps_right.txt", b""
+        )  # without which E-NeRF does not load
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        times = np.unique(self._to_us(trajectory.times))
+        header = "# timestamp[us] px py pz qx qy qz qw"
+        content = encode_poses(header, times.tolist(), *poses_at(trajectory, times * 1000))
+        self._replace(f"{self._data}/mocap_data.txt", content)
+
+    def _open_events(self) -> EventFiles:
+        import hdf5plugin
+
+        path = self.folder / f"{WRITTEN_SEQUENCE}-events_left.h5"
+        return Hdf5EventsFile(path, "events/", dict(hdf5plugin.Blosc("zstd")), self._to_us, self.events_held)
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        path = f"{self._data}/left_images/{self._name(number)}.png"
+        if blurred is None:
+            return {path: sharp}
+        return {path: blurred, f"sharp_images/{self._name(number)}.png": sharp}
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        """Exposures begin at the stamps, which are such that their middles are closest to the frames' times."""
+        exposure = round(self.setup.exposure / 1000)
+        stamp = (2 * time - 1000 * exposure + 1000) // 2000
+        folder = f"{self._data}/left_images"
+        return {
+            f"{folder}/image_timestamps_left.txt": f"{stamp}\n",
+            f"{folder}/image_exposures_left.txt": f"{exposure}\n",
+        }
+
+    @property
+    def _data(self) -> str:
+        return f"{WRITTEN_SEQUENCE}-vi_gt_data"
+
+
+def _pose_json(pose: np.ndarray) -> dict[str, float]:
+    values = [*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()]
+    return dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), values, strict=True))
+
+
+FORMAT = Format(
+    name="tum_vie",
+    command="tumvie-events",
+    description="Events of TUM-VIE, as published or prepared by E-NeRF's reference code.",
+    files=FILES,
+    read=read,
+    options=TumVieOptions,
+    writer=TumVieWriter,
+)

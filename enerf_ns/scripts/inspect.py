@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import html
 import io
 import math
-import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -24,9 +22,9 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, UserError
 from enerf_ns.dataparsers.event_index import event_picture
-from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.files import load_image, write_whole
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import (
@@ -38,6 +36,7 @@ from enerf_ns.dataparsers.problems import (
     unusual_rates,
 )
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.scripts.format_options import format_flags
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,23 +63,18 @@ class Inspect:
     """Folder of the recording. It is only ever read."""
     output: Path | None = None
     """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
-    event_camera: Literal["left", "right"] | None = None
-    """Which of TUM-VIE's two event cameras. None: left."""
+    options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 
     def main(self) -> None:
         data = self.data.expanduser().resolve()
         output = (self.output or Path(f"inspect-{data.name}.html")).expanduser().resolve()
         if output.is_dir():
-            raise RecordingError(f"--output {output} is a folder; give the name of an HTML file.")
+            raise FlagError(f"--output {output} is a folder; give the name of an HTML file.")
         if output.is_relative_to(data):
-            raise RecordingError(
+            raise FlagError(
                 f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
             )
-        if self.event_camera is None:
-            recording = read_recording(data)
-        else:
-            recording = read_recording(data, "tum_vie", event_camera=self.event_camera)
-        inspection = Inspection.of(recording)
+        inspection = Inspection.of(read_recording(data, **self.options.given()))
         inspection.print_tables()
         _write(output, inspection.page())
         CONSOLE.print(f"Pictures are in {output}", soft_wrap=True, highlight=False, markup=False)
@@ -421,13 +415,7 @@ def _data_uri(buffer: io.BytesIO, format: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        write_whole(path, text)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise RecordingError(f"--output {path} could not be written ({error.strerror}); give another file.") from error
+        raise OutputError(f"--output {path} could not be written ({error.strerror}); give another file.") from error

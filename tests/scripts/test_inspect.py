@@ -21,7 +21,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
@@ -165,7 +165,7 @@ def test_the_default_is_a_page_in_the_current_folder_and_the_recording_stays_as_
 @pytest.mark.parametrize("output", ["esim/page.html", "esim/images/page.html"])
 def test_nothing_is_written_into_the_recording(tmp_path: Path, output: str):
     folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError, match="never written to"):
+    with pytest.raises(FlagError, match="never written to"):
         Inspect(folder, tmp_path / output).main()
     assert not (tmp_path / output).exists()
 
@@ -173,9 +173,9 @@ def test_nothing_is_written_into_the_recording(tmp_path: Path, output: str):
 def test_a_page_that_cannot_be_written_is_said_in_one_sentence(tmp_path: Path):
     folder = write_esim(tmp_path / "esim")
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingError, match=r"^--output .* could not be written \(.*\); give another file\.$"):
+    with pytest.raises(OutputError, match=r"^--output .* could not be written \(.*\); give another file\.$"):
         Inspect(folder, tmp_path / "file" / "page.html").main()
-    with pytest.raises(RecordingError, match="is a folder"):
+    with pytest.raises(FlagError, match="is a folder"):
         Inspect(folder, tmp_path).main()
 
 
@@ -183,8 +183,9 @@ def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
     with pytest.raises(RecordingError, match="does not exist"):
         Inspect(tmp_path / "nowhere", tmp_path / "page.html").main()
     folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError):
-        Inspect(folder, tmp_path / "page.html", event_camera="right").main()
+    right = format_flags()(event_camera="right")  # type: ignore[call-arg] - a field made from the options of TUM-VIE
+    with pytest.raises(FlagError, match="--event-camera is for recordings of tum_vie, but .* is read as esim"):
+        Inspect(folder, tmp_path / "page.html", right).main()
     assert not (tmp_path / "page.html").exists()
 
 
