@@ -19,7 +19,7 @@ from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 
 
 def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:
-    """Copies a recording, with all its events, poses, frames and depth, into a new folder of the layout event_recording.
+    """Copies all events, poses, frames and depth of a recording into a new folder of the layout event_recording.
 
     Args:
         source: Folder of a recording of any registered format; only read.
@@ -34,8 +34,8 @@ def convert_recording(source: Path, output_dir: Path, **options: object) -> list
         FlagError: The format lacks an option.
         OutputError: The folder holds something, lies in the recording, or cannot be written.
     """
-    recording = read_recording(source, **options)  # type: ignore[arg-type]
     with _new_folder(source, output_dir) as folder:
+        recording = read_recording(source, **options)  # type: ignore[arg-type]
         num_events = event_recording.write(recording, folder)
     num_poses = len(recording.trajectory.times)
     num_frames = sum(len(frames.times) for frames in (recording.frames, recording.blurred_frames) if frames)

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError, UserError
 from enerf_ns.dataparsers.formats.registry import read_recording, writer_of
 from enerf_ns.dataparsers.formats.writer import Rig
 from enerf_ns.dataparsers.indexing import index_events
@@ -207,7 +207,7 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
     ],
 )
 def test_settings_that_make_no_recording_are_refused(tmp_path, wrong, sentence):
-    with pytest.raises(RecordingError, match=sentence):
+    with pytest.raises(UserError, match=sentence):
         Simulate(**{"scene": "shapes", "output_dir": tmp_path / "new", **SHORT, **wrong}).main()
     assert not list(tmp_path.iterdir())
 
