@@ -8,7 +8,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Shaped
+from jaxtyping import Float32, Float64, Int, Shaped
 
 ROUND_TRIP_TOLERANCE = 1e-6
 """Pixels between a pixel and the projection of its direction."""
@@ -25,6 +25,20 @@ STEEPEST_DIRECTION = 1e4
 ROTATION_TOLERANCE = 1e-3
 """Largest entry by which the product of a rotation and its transpose may differ from one."""
 
+LARGEST_SIDE = 2**16 - 1
+"""Pixels; larger columns and rows do not fit the types that events are stored in."""
+
+COEFFICIENTS = {
+    "pinhole": ((0,), "no coefficients"),
+    "radtan": ((4, 5), "finite numbers k1 k2 p1 p2 and perhaps k3"),
+    "fisheye": ((4,), "finite numbers k1 k2 k3 k4"),
+    "lookup": ((0,), "no coefficients"),
+}
+"""How many numbers the distortion of each model may have, and these in words."""
+
+CHECKED_STEP = 16
+"""Pixels between those at which a camera, when it is made, is checked to be a lens; its corners are among them."""
+
 INVERSION_STEPS = 60
 """Of a table of directions; each halves the error where the table is even, and lessens it up to fourfold stretching."""
 
@@ -34,7 +48,8 @@ class Camera:
     """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres.
 
     Raises:
-        ValueError: It fits no lens; a sentence that can follow "FILE holds".
+        ValueError: The size is not of whole pixels, a focal length is not above 0, the distortion has not as many
+            finite coefficients as the model, or all this fits no lens; a sentence that can follow "FILE holds".
     """
 
     width: int
@@ -54,6 +69,20 @@ class Camera:
     """For lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted camera."""
 
     def __post_init__(self) -> None:
+        if not all(0 < side <= LARGEST_SIDE and side == int(side) for side in (self.width, self.height)):
+            raise ValueError(
+                f"a camera of {self.width:g} x {self.height:g} pixels, but whole numbers from 1 to {LARGEST_SIDE} were "
+                "expected."
+            )
+        for name in ("width", "height"):
+            object.__setattr__(self, name, int(getattr(self, name)))
+        if not (self.fx > 0 and self.fy > 0):
+            raise ValueError(f"the focal lengths {self.fx:g} and {self.fy:g}, but they must be above 0 (pixels).")
+        counts, expected = COEFFICIENTS[self.model]
+        if len(self.distortion) not in counts or not np.isfinite(self.distortion).all():
+            raise ValueError(
+                f"the distortion {self.distortion} of the model {self.model}, but {expected} were expected."
+            )
         axes = ((self.width, self.fx, self.cx), (self.height, self.fy, self.cy))
         fits = all(
             SHORTEST_FOCAL_LENGTH * side < focal_length < LONGEST_FOCAL_LENGTH * side
@@ -65,11 +94,13 @@ class Camera:
                 f"a camera of {self.width} x {self.height} pixels with the focal lengths {self.fx:g} and {self.fy:g} "
                 f"and the principal point ({self.cx:g}, {self.cy:g}), which fits no lens; state all in pixels."
             )
-        if self.directions is not None and not np.abs(self.directions).max() < STEEPEST_DIRECTION:
-            raise ValueError(
-                f"a table of where each pixel of a camera looks, in which x / z and y / z reach "
-                f"{np.abs(self.directions).max():g}, which fits no lens; make it again."
+        if self.model == "lookup":
+            self._check_directions()
+        else:
+            columns, rows = (
+                np.union1d(np.arange(0, side, CHECKED_STEP), side - 1) for side in (self.width, self.height)
             )
+            self._directions_at(*np.meshgrid(columns, rows))
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 3"]:
@@ -80,7 +111,8 @@ class Camera:
         """Where the centre of each pixel looks: camera axes (x right, y down, z forward), z = 1, not normalised.
 
         Raises:
-            ValueError: The distortion has no inverse at some pixel, so that the calibration cannot be right.
+            ValueError: The distortion has no inverse at some pixel, so that the calibration cannot be right; a sentence
+                that can follow "FILE holds".
         """
         return self._pixel_directions.copy()
 
@@ -88,8 +120,28 @@ class Camera:
     def _pixel_directions(self) -> np.ndarray:
         if self.directions is not None:
             return np.dstack([self.directions, np.ones((self.height, self.width))])
-        rows, columns = np.mgrid[: self.height, : self.width].astype(float)
-        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+        return self._directions_at(*np.meshgrid(np.arange(self.width), np.arange(self.height)))
+
+    def _check_directions(self) -> None:
+        if self.directions is None:
+            raise ValueError("a camera of the model lookup without a table of where each pixel looks; give one.")
+        shape = (self.height, self.width, 2)
+        if self.directions.shape != shape or not np.isfinite(self.directions).all():
+            raise ValueError(
+                f"a table of where each pixel of a camera looks of shape {self.directions.shape}, but finite numbers "
+                f"of shape (height, width, 2) = {shape} were expected."
+            )
+        if not np.abs(self.directions).max() < STEEPEST_DIRECTION:
+            raise ValueError(
+                f"a table of where each pixel of a camera looks, in which x / z and y / z reach "
+                f"{np.abs(self.directions).max():g}, which fits no lens; make it again."
+            )
+
+    def _directions_at(
+        self, columns: Int[np.ndarray, "rows columns"], rows: Int[np.ndarray, "rows columns"]
+    ) -> Float64[np.ndarray, "rows columns 3"]:
+        """Where some pixels look, by the lens; ValueError where it has no inverse there."""
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(float)
         coefficients = np.array(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
         if self.model == "fisheye":
@@ -106,10 +158,10 @@ class Camera:
         wrong = ~(np.linalg.norm(projected - pixels, axis=-1) <= ROUND_TRIP_TOLERANCE)
         if wrong.any():
             raise ValueError(
-                f"the {self.model} distortion {self.distortion} has no inverse at {wrong.sum():,} of the "
-                f"{self.width} x {self.height} pixels"
+                f"the {self.model} distortion {self.distortion}, which fits no lens, since it has no inverse at "
+                f"{wrong.sum():,} of {wrong.size:,} pixels tried; calibrate again."
             )
-        return directions.reshape(self.height, self.width, 3)
+        return directions.reshape(*columns.shape, 3)
 
     def undistorted(self) -> Camera:
         """The pinhole camera of the same size whose image holds only pixels that this camera sees; itself if pinhole.

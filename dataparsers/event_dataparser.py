@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Annotated, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from tyro.conf import Suppress
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import exit_with_a_sentence
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.format import Format, FormatOptions
+from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 
@@ -57,56 +60,10 @@ class EventDataParserConfig(DataParserConfig):
     """Numbers of the frames to train on, from 0. None: all that are not held out."""
     held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
     """Numbers of the frames kept for evaluation, from 0. None: by held-out-every."""
-
-
-@dataclass
-class EsimDataParserConfig(EventDataParserConfig):
-    """A simulated recording in the folder layout of E-NeRF's ESIM sequences."""
-
-
-@dataclass
-class EsimNpzDataParserConfig(EventDataParserConfig):
-    """A simulated recording as Robust e-NeRF prepares it."""
-
-
-@dataclass
-class EsimBagDataParserConfig(EventDataParserConfig):
-    """A simulated recording as Robust e-NeRF publishes it: esim.bag."""
-
-
-@dataclass
-class DavisDataParserConfig(EventDataParserConfig):
-    """A recording in the text format of the UZH event-camera dataset (DAVIS240C)."""
-
-
-@dataclass
-class EdsDataParserConfig(EventDataParserConfig):
-    """A recording of EDS, as published or as prepared by E-NeRF's reference code."""
-
-
-@dataclass
-class TumVieDataParserConfig(EventDataParserConfig):
-    """A recording of TUM-VIE, as published or as prepared by E-NeRF's reference code."""
-
-    event_camera: Literal["left", "right"] = "left"
-    """Which of the two event cameras, with the frame camera beside it."""
-
-
-@dataclass
-class EventRecordingDataParserConfig(EventDataParserConfig):
-    """A recording of your own, in the folder layout of this package."""
-
-
-FORMATS = {
-    EventDataParserConfig: "auto",
-    EsimDataParserConfig: "esim",
-    EsimNpzDataParserConfig: "esim_npz",
-    EsimBagDataParserConfig: "esim_bag",
-    DavisDataParserConfig: "davis",
-    EdsDataParserConfig: "eds",
-    TumVieDataParserConfig: "tum_vie",
-    EventRecordingDataParserConfig: "event_recording",
-}
+    format: Suppress[str] = "auto"
+    """Name of a registered format, or auto to find out; what a sub-command stands for."""
+    options: Annotated[FormatOptions, tyro.conf.arg(name="")] = FormatOptions()  # noqa: RUF009 - frozen
+    """Of the format. A default and no default_factory, so that runs of before there were any can be loaded."""
 
 
 @dataclass
@@ -118,9 +75,8 @@ class EventDataParser(DataParser):
     def recording(self) -> EventRecording:
         """The recording of this parser's folder, read once per process."""
         config = self.config
-        options = {"event_camera": config.event_camera} if isinstance(config, TumVieDataParserConfig) else {}
         selection = config.time_range and tuple(config.time_range), config.keep_hot_pixels
-        return read_recording(config.data, FORMATS[type(config)], *selection, **options)
+        return read_recording(config.data, config.format, *selection, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         with exit_with_a_sentence():
@@ -138,7 +94,7 @@ class EventDataParser(DataParser):
         """
         near, far = scene_depth_range(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
-        frames = split_frames(recording, self.config, held_out=split != "train")
+        frames, are_frames = split_frames(recording, self.config, held_out=split != "train")
 
         poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
         camera_to_scene = np.einsum("ij,njk->nik", transform[:, :3], poses)
@@ -161,16 +117,20 @@ class EventDataParser(DataParser):
             image_filenames=list(frames.filenames),
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.from_numpy(box).float()),
-            metadata={"recording": recording, "frames": frames, "are_frames": frames.filenames[0].exists()},
+            metadata={"recording": recording, "frames": frames, "are_frames": are_frames},
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
 
 
-def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> Frames:
-    """The frames of one split; where the recording has none, instants along its trajectory to picture events at."""
+def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
+    """The frames of one split; where the recording has none, instants along its trajectory to picture events at.
+
+    Returns:
+        The frames, and whether they are some: otherwise, their file names stand for no files.
+    """
     if held_out and recording.held_out_frames:
-        return recording.held_out_frames
+        return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     if not held_out and config.train_frames == "blurred" and recording.blurred_frames:
         frames = recording.blurred_frames
@@ -191,7 +151,7 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
         chosen = np.isin(frames.numbers, config.train_frame_indices)
     else:
         chosen = used & ~evaluated
-    return frames.subset(np.flatnonzero(chosen if chosen.any() else used))
+    return frames.subset(np.flatnonzero(chosen if chosen.any() else used)), recording.has_frames
 
 
 def event_pictures(recording: EventRecording) -> Frames:
@@ -201,28 +161,20 @@ def event_pictures(recording: EventRecording) -> Frames:
     return Frames(filenames=names, times=times, camera=recording.camera, trajectory=recording.trajectory)
 
 
+def specification(format: Format) -> DataParserSpecification:
+    """The sub-command of a format, to be named as an entry point in the group nerfstudio.dataparser_configs."""
+    config = EventDataParserConfig(format=format.name, options=format.options())
+    return DataParserSpecification(config=config, description=format.description)
+
+
 event_data = DataParserSpecification(
     config=EventDataParserConfig(), description="A recording of an event camera, in any format that enerf-ns reads."
 )
-esim_events = DataParserSpecification(
-    config=EsimDataParserConfig(), description="Events in the folder layout of E-NeRF's ESIM sequences."
-)
-esim_npz = DataParserSpecification(
-    config=EsimNpzDataParserConfig(), description="Events in the .npz layout of Robust e-NeRF's simulated sequences."
-)
-esim_bag = DataParserSpecification(
-    config=EsimBagDataParserConfig(), description="Events in esim.bag of Robust e-NeRF's simulated sequences."
-)
-davis_events = DataParserSpecification(
-    config=DavisDataParserConfig(), description="Events in the text format of the UZH event-camera dataset."
-)
-eds_events = DataParserSpecification(
-    config=EdsDataParserConfig(), description="Events of EDS, as published or prepared by E-NeRF's reference code."
-)
-tumvie_events = DataParserSpecification(
-    config=TumVieDataParserConfig(),
-    description="Events of TUM-VIE, as published or prepared by E-NeRF's reference code.",
-)
-event_recording = DataParserSpecification(
-    config=EventRecordingDataParserConfig(), description="Events in the folder layout of enerf-ns, from any camera."
-)
+
+
+def __getattr__(name: str) -> DataParserSpecification:
+    """The specification of a registered format by its sub-command, such as `eds_events` for eds-events."""
+    for format in formats():
+        if format.command.replace("-", "_") == name:
+            return specification(format)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,11 @@ from enerf_ns.dataparsers.errors import RecordingError, UserError
 
 
 @contextmanager
-def of_file(path: Path) -> Iterator[None]:
+def of_file(path: Path | str) -> Iterator[None]:
     """Says of a value that does not check itself as sound which file it came from.
 
     Args:
-        path: The file, or the folder.
+        path: The file or the folder; in words, a part of one, such as "camchain.yaml, cam0,".
 
     Raises:
         RecordingError: `path holds`, and what the ValueError of the block says.
@@ -31,7 +32,34 @@ def of_file(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except ValueError as error:
-        raise RecordingError(f"{path} holds {error}") from error
+        raise RecordingError(f"{path} holds {str(error).rstrip('.')}.") from error
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[None]:
+    """Turns whatever a library raises at a damaged file into one sentence about it.
+
+    Args:
+        path: The file.
+        expected: What it is to hold, such as "an HDF5 file with events".
+
+    Raises:
+        RecordingError: Anything went wrong.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # of any kind, since libraries have their own for what is damaged
+        if not path.exists():
+            raise RecordingError(f"{path} is missing; {expected} was expected there.") from error
+        if path.is_file() and path.stat().st_size == 0:
+            raise RecordingError(f"{path} is empty; {expected} was expected.") from error
+        lines = str(error).strip("\"' \n").splitlines() or [type(error).__name__]
+        reason = lines[0].rstrip(".").replace(". ", ", ")
+        raise RecordingError(
+            f"{path} cannot be read as {expected} ({reason}); copy it again from its source."
+        ) from error
 
 
 def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
@@ -40,7 +68,7 @@ def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
     Raises:
         RecordingError: The file is missing or cannot be decoded.
     """
-    try:
+    with reading(path, "an image"):
         with Image.open(path) as image:
             image.verify()  # the checksums of a PNG, which decoding passes over
         with Image.open(path) as image:
@@ -48,12 +76,15 @@ def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
                 return (np.asarray(image).clip(0, 65535) // 256).astype(np.uint8)[..., None]
             grey = image.mode in ("1", "L", "LA")
             if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info:
-                colors = image.convert("RGBA")
-                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colors)
+                colours = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colours)
             pixels = np.array(image.convert("L" if grey else "RGB"))
-    except Exception as error:  # of any kind, since Pillow has some of its own for what is damaged
-        raise unreadable(path, "an image", error) from error
-    return pixels[..., None] if grey else pixels
+        return pixels[..., None] if grey else pixels
+
+
+def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
+    """An image with three channels, equal ones where it is grey [height, width]."""
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
 def check_image_size(path: Path, width: int, height: int) -> None:
@@ -74,11 +105,8 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         RecordingError: The file is missing or no image.
     """
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as error:  # of any kind, since Pillow has some of its own for what is damaged
-        raise unreadable(path, "an image", error) from error
+    with reading(path, "an image"), Image.open(path) as image:
+        return image.size
 
 
 def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, "..."]:
@@ -91,22 +119,11 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
     Raises:
         RecordingError: The file is missing, or holds no such array.
     """
-    try:
+    with reading(path, "a NumPy array (.npy)"):
         array = np.load(path, mmap_mode=mmap_mode)  # type: ignore[arg-type]
-    except Exception as error:  # of any kind, since NumPy parses the header as Python
-        raise unreadable(path, "a NumPy array (.npy)", error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")
     return array
-
-
-def unreadable(path: Path, expected: str, error: Exception) -> RecordingError:
-    if not path.exists():
-        return RecordingError(f"{path} is missing; {expected} was expected there.")
-    if path.is_file() and path.stat().st_size == 0:
-        return RecordingError(f"{path} is empty; {expected} was expected.")
-    reason = str(error).splitlines()[0].rstrip(".") if str(error) else type(error).__name__
-    return RecordingError(f"{path} cannot be read as {expected} ({reason}); copy it again from its source.")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -115,29 +132,67 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         RecordingError: The file is missing or holds no JSON object.
     """
-    try:
+    with reading(path, "JSON"):
         value = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise unreadable(path, "JSON", error) from error
     if not isinstance(value, dict):
         raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
     return value
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Writes a file beside its place and then renames it, so that it is whole or not there, or as it was before.
+    """Writes a file so that it is whole or not there, or as it was before.
 
     Args:
-        path: In a folder that exists.
+        path: Its folder is made where it does not exist.
         content: Text is encoded as UTF-8.
 
     Raises:
         OSError: The disk is full, or the folder cannot be written to; nothing is left then.
     """
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    write_together(path.parent, {path.name: content.encode() if isinstance(content, str) else content})
+
+
+def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] | None = None) -> None:
+    """Writes files and appends lines to tables, all or, if anything fails, none.
+
+    Args:
+        folder: That the paths begin at.
+        files: What each file shall hold, by path; one that is there already is replaced.
+        lines: What is appended to each table of text, by path.
+
+    Raises:
+        OSError: The disk is full, or a folder cannot be written to; all is as it was before then, except that of
+            several files that are replaced some may be the new ones.
+    """
+    lines = lines or {}
+    partials = {path: (folder / path).with_name(f".{Path(path).name}.partial-{os.getpid()}") for path in files}
+    replaced = [path for path in files if (folder / path).exists()]
+    lengths = {path: (folder / path).stat().st_size for path in lines if (folder / path).exists()}
     try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
+        for path, content in files.items():
+            partials[path].parent.mkdir(parents=True, exist_ok=True)
+            partials[path].write_bytes(content)
+        for path, line in lines.items():
+            with open(folder / path, "ab", buffering=0) as table:
+                write_all(table, line.encode())
+        for path, partial in partials.items():
+            partial.replace(folder / path)
     except BaseException:
-        partial.unlink(missing_ok=True)
+        for path in {*files, *lines}.difference(replaced, lengths):
+            (folder / path).unlink(missing_ok=True)
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
+        for path, length in lengths.items():
+            os.truncate(folder / path, length)
         raise
+
+
+def write_all(file: FileIO, content: bytes) -> None:
+    """Writes to an unbuffered file, which may take less than it is given when the disk is nearly full.
+
+    Raises:
+        OSError: The disk is full; a part may be written.
+    """
+    left = memoryview(content)
+    while left:
+        left = left[file.write(left) :]

@@ -22,6 +22,9 @@ EVENTS_AT_A_TIME = 2**18
 LARGEST_SPAN_RATIO = 300
 """Between the spans of events or frames and poses; units of time differ by 1000."""
 
+LONGEST_REFRACTORY_PERIOD = 10**12
+"""Nanoseconds."""
+
 SHORTEST_FRAME_STEP = 1_000_000
 """Nanoseconds; frames closer together than this are in another unit if they also span hardly any of the poses."""
 
@@ -80,6 +83,8 @@ class EventRecording:
 
     Raises:
         RecordingError: The frames and the poses span times that do not fit together.
+        ValueError: A threshold, the refractory period, the colour filter, the response or the range of depth is not as
+            its field says; a sentence that can follow "FILE holds".
     """
 
     path: Path
@@ -103,14 +108,14 @@ class EventRecording:
     contrast_thresholds: tuple[float, float] | None = None
     """Of on and of off events, above 0, where the recording knows them."""
     refractory_period: int = 0
-    """For how long a pixel is blind after an event, ns."""
+    """For how long a pixel is blind after an event, ns; at most 1000 s."""
     bayer_pattern: str | None = None
     """Colours of the sensor's pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; None: a grey sensor."""
     response: str | None = None
     """How the sensor answers brightness, in the words of `enerf_ns.sensor.response`: linlog, or logarithm:OFFSET; None
     where the recording does not state it."""
     depth_range: tuple[float, float] | None = None
-    """Nearest and farthest depth in metres, where the recording knows them."""
+    """Nearest and farthest depth in metres, above 0, where the recording knows them."""
     notes: tuple[str, ...] = ()
     """What was dropped or renormalised, one sentence each; what is said of the events is with their index."""
     shares_outside_poses: dict[str, float] = field(default_factory=dict)
@@ -128,6 +133,7 @@ class EventRecording:
     unless given."""
 
     def __post_init__(self) -> None:
+        self._check_what_is_stated()
         if not self.event_file_states:
             states = [(file.resolve(), file.stat()) for file in self.event_files]
             self._set(event_file_states=tuple((str(path), state.st_size, state.st_mtime_ns) for path, state in states))
@@ -177,6 +183,35 @@ class EventRecording:
         """The recording itself: it is read-only and large, and Nerfstudio copies what it hands to data sets."""
         return self
 
+    def _check_what_is_stated(self) -> None:
+        on, off = self.contrast_thresholds or (1.0, 1.0)
+        if not (0 < on < np.inf and 0 < off < np.inf):
+            raise ValueError(
+                f"the contrast thresholds {on:g} (of on events) and {off:g} (of off events), but both must be above 0."
+            )
+        if not 0 <= self.refractory_period <= LONGEST_REFRACTORY_PERIOD:
+            raise ValueError(
+                f"the refractory period {self.refractory_period:g} ns, but from 0 to {LONGEST_REFRACTORY_PERIOD:g} ns "
+                "were expected."
+            )
+        pattern = self.bayer_pattern
+        if pattern is not None and not (isinstance(pattern, str) and len(pattern) == 4 and set(pattern) <= set("RGB")):
+            raise ValueError(
+                f"the Bayer pattern {pattern!r}, but four letters of R, G and B, the colours of the pixels (0, 0), "
+                "(1, 0), (0, 1) and (1, 1), such as RGGB, were expected."
+            )
+        if self.response is not None and not _is_response(self.response):
+            raise ValueError(
+                f"the response {self.response!r}, but linlog, or logarithm:OFFSET with an offset above 0, such as "
+                "logarithm:0.001, was expected."
+            )
+        near, far = self.depth_range or (1.0, 2.0)
+        if not 0 < near < far < np.inf:
+            raise ValueError(
+                f"the range of depth {near:g} m to {far:g} m, but the nearest and, farther than that, the farthest "
+                "depth, both above 0, were expected."
+            )
+
     def _set(self, **values: object) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -200,6 +235,17 @@ class EventRecording:
         notes.append(left_out(dropped, len(frames.times), what))
         shares[what] = dropped / len(frames.times)
         return frames.subset(inside) if len(inside) else None
+
+
+def _is_response(name: object) -> bool:
+    """Whether it has the form of a response's name, whatever offsets a sensor allows."""
+    if name == "linlog":
+        return True
+    kind, _, offset = name.partition(":") if isinstance(name, str) else ("", "", "")
+    try:
+        return kind == "logarithm" and 0 < float(offset) < np.inf
+    except ValueError:
+        return False
 
 
 def left_out(dropped: int, total: int, what: str) -> str:

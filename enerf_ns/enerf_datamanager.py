@@ -18,8 +18,9 @@ from tyro.conf import OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
 from enerf_ns.dataparsers.errors import FlagError
-from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_data
 from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.event_dataset import EventDataset
@@ -29,9 +30,12 @@ from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.ray_samplers import PairedRayBundle
 from enerf_ns.sensor.sensor_model import SensorModel
 
+DATAPARSERS = {name: config for name, config in all_dataparsers.items() if isinstance(config, EventDataParserConfig)}
 EventDataParserUnion = OmitSubcommandPrefixes[
     subcommand_type_from_defaults(
-        {name: config for name, config in all_dataparsers.items() if isinstance(config, EventDataParserConfig)},
+        DATAPARSERS,
+        {format.command: format.description for format in formats() if format.command in DATAPARSERS}
+        | {"event-data": event_data.description or ""},
         prefix_names=False,
     )
 ]

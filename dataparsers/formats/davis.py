@@ -19,7 +19,8 @@ import numpy as np
 from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, image_size
+from enerf_ns.dataparsers.files import check_image_size, image_size, of_file
+from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -94,16 +95,9 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
 def _read_camera(path: Path, width: int, height: int) -> Camera:
     rows, numbers = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
     fx, fy, cx, cy, *distortion = parse_numbers(path, rows, numbers)[0].tolist()
-    if fx <= 0 or fy <= 0:
-        raise RecordingError(f"{path} holds the focal lengths {fx:g} and {fy:g}, but they must be above 0 (pixels).")
-    if not any(distortion):
-        return Camera(width, height, fx, fy, cx, cy)
-    camera = Camera(width, height, fx, fy, cx, cy, tuple(distortion), "radtan")
-    try:
-        camera.pixel_directions()
-    except ValueError as error:
-        raise RecordingError(f"{path} (fx fy cx cy k1 k2 p1 p2 k3) fits no lens: {error}.") from error
-    return camera
+    model = "radtan" if any(distortion) else "pinhole"
+    with of_file(f"{path} (fx fy cx cy k1 k2 p1 p2 k3)"):
+        return Camera(width, height, fx, fy, cx, cy, tuple(distortion) if any(distortion) else (), model)
 
 
 def _first_event_time(path: Path) -> int:
@@ -232,3 +226,12 @@ def _parse_lines(text, t, x, y, p):
             i += 1
         i += 1
     return len(t)
+
+
+FORMAT = Format(
+    name="davis",
+    command="davis-events",
+    description="Events in the text format of the UZH event-camera dataset.",
+    files=FILES,
+    read=read,
+)

@@ -1,4 +1,4 @@
-"""Reader for EDS, as it is unpacked and as E-NeRF's reference code prepares it.
+"""Reader of EDS, as it is unpacked and as E-NeRF's reference code prepares it, and writer of the former.
 
 As unpacked, on a clock of absolute times:
 
@@ -24,20 +24,23 @@ Hidalgo-Carrió et al., "Event-aided direct sparse odometry", CVPR 2022.
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, check_rotation
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
+from enerf_ns.dataparsers.formats.json_values import parse_array
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
@@ -49,11 +52,11 @@ RAW_POSES, PREPARED_POSES = "stamped_groundtruth.txt", "stamped_groundtruth_us.t
 RAW_IMAGES, PREPARED_IMAGES = "images", "images_undistorted_calib0"
 STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
 
+CLOCK_START = 1000 * 10**9
+"""What the clock of a recording that is written shows (ns) when the simulation's is at 0."""
+
 OFFSET_TOLERANCE = 2000
 """ns by which the preparation may round a time."""
-
-CHECKED_STEP = 16
-"""Of all rows and columns, one of so many is looked at to see whether a calibration is of a lens."""
 
 KALIBR_MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
 """Kalibr's names of the distortion models, and ours."""
@@ -110,21 +113,18 @@ def read(folder: Path) -> EventRecording:
         rgb_camera, camera, event_from_rgb = _read_camchain(camchain)
     rectify_map_file = folder / "rectify_map_calib0.h5"
     raw_events = not (prepared and rectify_map_file.exists())
-    if raw_events:
-        _check_lens(camera, camchain)
-    else:
+    if not raw_events:
         undistorted = _read_undistorted_camera(folder, 1)
         places = read_rectify_map(rectify_map_file, *SENSOR_SIZE).astype(float)
         directions = (places - undistorted.matrix[:2, 2]) / undistorted.matrix[[0, 1], [0, 1]]
-        camera = replace(undistorted, model="lookup", directions=directions)
+        with of_file(rectify_map_file):
+            camera = replace(undistorted, model="lookup", directions=directions)
     frames = None
     if image_files:
         if image_files[0].parent.name == PREPARED_IMAGES:
             rgb_camera = _read_undistorted_camera(folder, 0)
         for file in image_files:
             check_image_size(file, rgb_camera.width, rgb_camera.height)
-        if rgb_camera.model != "pinhole":
-            _check_lens(rgb_camera, camchain)
         frames = Frames(image_files, image_times - zero, rgb_camera, trajectory.of_mounted(event_from_rgb))
     if frames is not None or raw_events:
         if camchain is None:
@@ -310,16 +310,11 @@ def _kalibr_camera(path: Path, name: str, entry: dict) -> Camera:
         )
     fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", (4,)).tolist()
     width, height = _numbers(path, name, entry, "resolution", (2,)).tolist()
-    if not (fx > 0 and fy > 0 and all(0 < size < 2**16 and size == int(size) for size in (width, height))):
-        raise RecordingError(
-            f"{path} holds focal lengths {fx:g} and {fy:g} and the resolution {width:g} x {height:g} of {name}, but "
-            "all must be above 0 (pixels), and the resolution whole."
-        )
-    camera = Camera(int(width), int(height), fx, fy, cx, cy)
-    if distortion_model == "none":
-        return camera
-    distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
-    return replace(camera, distortion=distortion, model=KALIBR_MODELS[distortion_model])
+    distortion: tuple[float, ...] = ()
+    if distortion_model != "none":
+        distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
+    with of_file(f"{path}, {name},"):
+        return Camera(width, height, fx, fy, cx, cy, distortion, KALIBR_MODELS[distortion_model])
 
 
 def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -336,40 +331,99 @@ def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...
     return values
 
 
-def _check_lens(camera: Camera, camchain: Path | None) -> None:
-    """Whether each pixel, of a few over the whole image, sees one direction."""
-    width, height = camera.width // CHECKED_STEP + 1, camera.height // CHECKED_STEP + 1
-    lens = {name: getattr(camera, name) / CHECKED_STEP for name in ("fx", "fy", "cx", "cy")}
-    try:
-        replace(camera, width=width, height=height, **lens).pixel_directions()
-    except ValueError as error:
-        raise RecordingError(
-            f"{camchain} holds the {camera.model} distortion {camera.distortion}, which fits no lens, since it folds "
-            "the image; calibrate again."
-        ) from error
-
-
 def _read_undistorted_camera(folder: Path, number: int) -> Camera:
     """Of the RGB (0) or the event camera (1) after the preparation."""
     path = folder / "calib_undist_calib0.json"
+    entries = read_json(path).get("intrinsics_undistorted")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["intrinsics_undistorted"]
-        values = [entries[number][key] for key in ("fx", "fy", "cx", "cy")]
-        if len(entries) != 2 or any(isinstance(value, bool) for value in values):
-            raise ValueError("four numbers of each of two cameras were expected")
-        fx, fy, cx, cy = map(float, values)
-    except FileNotFoundError as error:
+        if not isinstance(entries, list) or len(entries) != 2:
+            raise ValueError("two cameras were expected")
+        fx, fy, cx, cy = parse_array([entries[number][key] for key in ("fx", "fy", "cx", "cy")], (4,)).tolist()
+    except (ValueError, LookupError, TypeError) as error:
         raise RecordingError(
-            f"{path} is missing; intrinsics_undistorted of the RGB and the event camera was expected."
-        ) from error
-    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        raise RecordingError(
-            f"{path} cannot be read as JSON with intrinsics_undistorted, fx fy cx cy (pixels) of the RGB and the event "
+            f"{path} holds no intrinsics_undistorted with numbers fx fy cx cy (pixels) of the RGB and the event "
             "camera; prepare the recording again."
         ) from error
-    if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
-        raise RecordingError(
-            f"{path} holds fx {fx:g}, fy {fy:g}, cx {cx:g} and cy {cy:g}, but finite numbers of pixels, and fx and fy "
-            "above 0, were expected."
+    with of_file(path):
+        return Camera(*SENSOR_SIZE, fx, fy, cx, cy)
+
+
+class EdsWriter(Writer):
+    """EDS as it is unpacked. The published files do not state exposures; simulation.json does."""
+
+    layout = "eds"
+    start = CLOCK_START
+    published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA, PUBLISHED_EXTRINSICS)
+
+    def add_events(self, events: Events) -> None:
+        """As of `Writer.add_events`, up to 1 µs before the last frame, since E-NeRF's loader wants that to be last."""
+        until = int(np.searchsorted(events.t, self.setup.frame_times[-1] - 1000))
+        super().add_events(Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until]))
+
+    def _check(self) -> None:
+        self._check_size(SENSOR_SIZE)
+        for camera in (self.setup.event_camera, self.setup.frame_camera):
+            if camera.model == "lookup" or (camera.model == "radtan" and len(camera.distortion) != 4):
+                raise FlagError(
+                    f"The layout eds holds cameras without distortion, or with 4 coefficients of it (radtan or "
+                    f"fisheye), but one of {len(camera.distortion)} of {camera.model} was asked for; choose another."
+                )
+
+    def _write_calibration(self) -> None:
+        setup = self.setup
+        rgb = _kalibr(setup.frame_camera, "/cam0/image_raw", 1)
+        event = _kalibr(setup.event_camera, "/cam1/events", 0)
+        event["T_cn_cnm1"] = setup.event_from_frame.tolist()
+        content = f"cam0: # This is the RGB camera\n{_yaml(rgb)}cam1: # This is the event camera\n{_yaml(event)}"
+        self._replace("camchain.yaml", content.encode())
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        times = (trajectory.times + CLOCK_START).tolist()
+        stamps = [f"{time // 10**9}.{time % 10**9:09d}" for time in times]
+        header = "# timestamp[s] px py pz qx qy qz qw"
+        content = encode_poses(header, stamps, trajectory.positions, trajectory.quaternions)
+        self._replace(RAW_POSES, content)
+
+    def _open_events(self) -> EventFiles:
+        return Hdf5EventsFile(
+            self.folder / "events.h5", "", {}, lambda times: self._to_us(times) + CLOCK_START // 1000, self.events_held
         )
-    return Camera(*SENSOR_SIZE, fx, fy, cx, cy)
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        path = f"{RAW_IMAGES}/frame_{number:010d}.png"
+        if blurred is None:
+            return {path: in_colour(sharp)}
+        return {path: in_colour(blurred), f"sharp_images/{self._name(number)}.png": in_colour(sharp)}
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        return {"images_timestamps.txt": f"{int(self._to_us(np.array(time))) + CLOCK_START // 1000}\n"}
+
+
+def _yaml(value: dict) -> str:
+    import yaml
+
+    text = yaml.safe_dump(value, default_flow_style=None)
+    return "".join(f"  {line}\n" for line in text.splitlines())
+
+
+def _kalibr(camera: Camera, topic: str, other: int) -> dict[str, Any]:
+    models = {ours: kalibrs for kalibrs, ours in KALIBR_MODELS.items()}
+    return {
+        "cam_overlaps": [other],
+        "camera_model": "pinhole",
+        "distortion_coeffs": list(map(float, camera.distortion)),
+        "distortion_model": models[camera.model],
+        "intrinsics": list(map(float, (camera.fx, camera.fy, camera.cx, camera.cy))),
+        "resolution": [camera.width, camera.height],
+        "rostopic": topic,
+    }
+
+
+FORMAT = Format(
+    name="eds",
+    command="eds-events",
+    description="Events of EDS, as published or prepared by E-NeRF's reference code.",
+    files=FILES,
+    read=read,
+    writer=EdsWriter,
+)

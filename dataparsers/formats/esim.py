@@ -1,4 +1,4 @@
-"""Reader for E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
+"""Reader and writer of E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
 
     events/*.npy                (n, 4) x y t_ns p, in time order over the files by name; a fifth column is ignored
     *poses_all*.txt             t_ns px py pz qx qy qz qw after a header line; camera to world, OpenCV axes, metres
@@ -13,20 +13,28 @@ One camera takes events and frames, without distortion, and stamps are nanosecon
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, load_array
-from enerf_ns.dataparsers.formats.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import in_colour, load_array, of_file, read_json
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.frame_folders import read_frames
+from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
+from enerf_ns.dataparsers.formats.text_tables import read_poses
+from enerf_ns.dataparsers.formats.writer import EventFiles, GrowingArray, Writer, encode_npy, encode_poses, poses_at
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
+
+FEWEST_POSES = 101
+"""That the reference code of E-NeRF accepts."""
 
 
 def read(folder: Path) -> EventRecording:
@@ -52,29 +60,30 @@ def read(folder: Path) -> EventRecording:
     simulation_file = folder / "simulation.json"
     contrast_thresholds = None
     if simulation_file.exists():
-        simulation = _read_simulation(simulation_file)
-        contrast_thresholds = _two_positive(simulation_file, simulation, "contrast_thresholds")
-        depth_range = _two_positive(simulation_file, simulation, "depth_range") or depth_range
+        simulation = read_json(simulation_file)
+        contrast_thresholds = _two_numbers(simulation_file, simulation, "contrast_thresholds")
+        depth_range = _two_numbers(simulation_file, simulation, "depth_range") or depth_range
         camera = _simulated_camera(simulation_file, simulation) or camera
 
     frames = _read_frames(folder / "images", camera, trajectory)
     blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory)
     num_rows = [_num_rows(file) for file in event_files]
-    return EventRecording(
-        path=folder,
-        format="esim",
-        camera=camera,
-        trajectory=trajectory,
-        stream_events=lambda: _stream_events(event_files, num_rows),
-        event_files=tuple(event_files),
-        frames=frames,
-        blurred_frames=blurred_frames,
-        contrast_thresholds=contrast_thresholds,
-        depth_range=depth_range,
-        notes=tuple(notes),
-        locate_event=lambda index: _locate(event_files, num_rows, index),
-        num_events=sum(num_rows),
-    )
+    with of_file(simulation_file):
+        return EventRecording(
+            path=folder,
+            format="esim",
+            camera=camera,
+            trajectory=trajectory,
+            stream_events=lambda: _stream_events(event_files, num_rows),
+            event_files=tuple(event_files),
+            frames=frames,
+            blurred_frames=blurred_frames,
+            contrast_thresholds=contrast_thresholds,
+            depth_range=depth_range,
+            notes=tuple(notes),
+            locate_event=lambda index: _locate(event_files, num_rows, index),
+            num_events=sum(num_rows),
+        )
 
 
 def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
@@ -82,34 +91,18 @@ def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
         raise RecordingError(f"{path} holds an array of shape {rows.shape}, but (N, 17) was expected.")
     height, width, focal_length = rows[0, :15].reshape(3, 5)[:, 4].tolist()
-    if not (_is_size(height) and _is_size(width) and 0 < focal_length < np.inf):
-        raise RecordingError(
-            f"{path} holds height {height:g}, width {width:g} and focal length {focal_length:g} in its first row, but "
-            "they must be above 0, and height and width whole pixels."
-        )
-    camera = Camera(int(width), int(height), focal_length, focal_length, width / 2, height / 2)
+    with of_file(path):
+        camera = Camera(width, height, focal_length, focal_length, width / 2, height / 2)
     bounds = rows[:, 15:]
     near, far = float(bounds[:, 0].min()), float(bounds[:, 1].max())
     return camera, (near, far) if 0 < near < far < np.inf else None
 
 
-def _read_simulation(path: Path) -> dict:
-    try:
-        simulation = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} cannot be read as JSON ({error}); simulate it again or remove it.") from error
-    if not isinstance(simulation, dict):
-        raise RecordingError(f"{path} holds a {type(simulation).__name__}, but a JSON object was expected.")
-    return simulation
-
-
-def _two_positive(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
-    value = simulation.get(name)
-    if value is None:
+def _two_numbers(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
+    if simulation.get(name) is None:
         return None
-    if not (isinstance(value, list) and len(value) == 2 and all(_is_positive(number) for number in value)):
-        raise RecordingError(f"{path} holds {name} = {value!r}, but two numbers above 0 were expected.")
-    return float(value[0]), float(value[1])
+    first, second = parse_numbers(path, name, simulation[name], (2,), "two numbers").tolist()
+    return first, second
 
 
 def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
@@ -117,46 +110,18 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
     if camera is None:
         return None
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    try:
-        width, height, fx, fy, cx, cy = parse_array([camera[name] for name in names], (6,)).tolist()
-        good = _is_size(width) and _is_size(height) and fx > 0 and fy > 0
-    except (TypeError, KeyError, ValueError):
-        good = False
-    if not good:
-        raise RecordingError(
-            f"{path} holds camera = {camera!r}, but the numbers {', '.join(names)} in pixels were expected."
-        )
-    return Camera(int(width), int(height), fx, fy, cx, cy)
+    if not isinstance(camera, dict):
+        raise RecordingError(f"{path} holds camera = {shown(camera)}, but {', '.join(names)} in pixels were expected.")
+    values = [camera.get(name) for name in names]
+    numbers = parse_numbers(path, f"camera ({', '.join(names)})", values, (6,), "numbers of pixels")
+    with of_file(path):
+        return Camera(*numbers.tolist())
 
 
 def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory) -> Frames | None:
-    files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
-    stamps_file = folder / "image_stamps_ns.txt"
-    if not files and not stamps_file.exists():
-        return None
-    times = read_times(stamps_file, "ns")
-    if len(times) != len(files):
-        raise RecordingError(
-            f"{folder} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; give one each."
-        )
-    for file in files:
-        check_image_size(file, camera.width, camera.height)
-    depth_folder = folder.parent / "depth"
-    depth_files = tuple(sorted(depth_folder.glob("*.npy")))
-    if not depth_files:
-        return Frames(files, times, camera, trajectory)
-    if len(depth_files) != len(files):
-        raise RecordingError(
-            f"{depth_folder} holds {len(depth_files)} depth maps, but {folder} holds {len(files)} images."
-        )
-    for file in depth_files:
-        shape = load_array(file, mmap_mode="r").shape
-        if shape != (camera.height, camera.width):
-            raise RecordingError(
-                f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
-                f"{(camera.height, camera.width)}."
-            )
-    return Frames(files, times, camera, trajectory, depth_files)
+    files = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
+    depth_files = sorted((folder.parent / "depth").glob("*.npy"))
+    return read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
 
 
 def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
@@ -203,9 +168,100 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
     return str(files[-1])
 
 
-def _is_positive(number: object) -> bool:
-    return isinstance(number, (int, float)) and not isinstance(number, bool) and 0 < number < 1e9
+class EsimWriter(Writer):
+    """E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
+
+    layout = "esim"
+    fewest_frames = 11
+
+    def _check(self) -> None:
+        setup, camera = self.setup, self.setup.event_camera
+        centred = Camera(camera.width, camera.height, camera.fx, camera.fx, camera.width / 2, camera.height / 2)
+        if not (camera == setup.frame_camera == centred and np.allclose(setup.event_from_frame, np.eye(4), atol=1e-12)):
+            raise FlagError(
+                "The layout esim holds one camera for events and frames, without distortion, with one focal length and "
+                "the principal point at (width / 2, height / 2); choose such a camera or another layout."
+            )
+
+    def _write_calibration(self) -> None:
+        self._write_bounds()
+
+    def _write_bounds(self) -> None:
+        """LLFF's rows [R | t | height width focal], axes down, right and back, and the nearest and farthest depth."""
+        camera, trajectory, times = self.setup.event_camera, self.setup.trajectory, self.setup.frame_times
+        poses = np.tile(np.eye(3, 4), (len(times), 1, 1))
+        if trajectory is not None:
+            poses = trajectory.poses(torch.from_numpy(times)).numpy()
+        axes = np.stack([poses[:, :, 1], poses[:, :, 0], -poses[:, :, 2], poses[:, :, 3]], axis=2)
+        sizes = np.tile(np.array([[camera.height], [camera.width], [camera.fx]]), (len(times), 1, 1))
+        rows = np.concatenate([axes, sizes], axis=2).reshape(len(times), 15)
+        bounds = np.tile(self.depth_range or (0.0, 0.0), (len(times), 1))
+        self._replace("poses_bounds.npy", encode_npy(np.column_stack([rows, bounds]), np.float64))
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        """All poses and, where they are too few, some between them, which leave the interpolated path as it is."""
+        times = trajectory.times
+        parts = -(-FEWEST_POSES // (len(times) - 1))
+        if len(times) < FEWEST_POSES:
+            between = [start + (end - start) * np.arange(parts) // parts for start, end in pairwise(times)]
+            times = np.unique(np.append(np.concatenate(between), times[-1]))
+            positions, quaternions = poses_at(trajectory, times)
+        else:
+            positions, quaternions = trajectory.positions, trajectory.quaternions
+        self._replace("poses_all.txt", encode_poses("# t_ns px py pz qx qy qz qw", times, positions, quaternions))
+
+    def _open_events(self) -> EventFiles:
+        paths = [f"events/{self._name(number)}.npy" for number in range(len(self.setup.frame_times))]
+        return IntervalFiles([self.folder / path for path in paths], self.setup.frame_times)
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        images = {f"images/{self._name(number)}.png": in_colour(sharp)}
+        if blurred is not None:
+            images[f"images_corrupted/{self._name(number)}.png"] = in_colour(blurred)
+        return images
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        folders = ("images", "images_corrupted") if self.setup.exposure else ("images",)
+        return {f"{folder}/image_stamps_ns.txt": f"{time}\n" for folder in folders}
+
+    def _write_summary(self, finished: bool) -> None:
+        if self.depth_range is not None:
+            self._write_bounds()
+        super()._write_summary(finished)
 
 
-def _is_size(number: float) -> bool:
-    return 0 < number < 2**16 and number == int(number)
+class IntervalFiles:
+    """One file for each frame, with the events after it up to the next; those before the first are in its file."""
+
+    def __init__(self, paths: list[Path], frame_times: np.ndarray):
+        for path in paths:
+            GrowingArray(path, np.int64, (4,)).close()
+        self._paths, self._ends, self._number = paths, frame_times[1:], 0
+        self._file = GrowingArray(paths[0], np.int64, (4,))
+
+    def append(self, events: Events) -> None:
+        rows = np.column_stack([events.x, events.y, events.t, events.p]).astype(np.int64)
+        while len(rows):
+            count = len(rows)
+            if self._number < len(self._ends):
+                count = int(np.searchsorted(rows[:, 2], self._ends[self._number], side="right"))
+            self._file.append(rows[:count])
+            self._file.commit(self._file.num_rows + count)
+            rows = rows[count:]
+            if len(rows):
+                self._file.close()
+                self._number += 1
+                self._file = GrowingArray(self._paths[self._number], np.int64, (4,))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+FORMAT = Format(
+    name="esim",
+    command="esim-events",
+    description="Events in the folder layout of E-NeRF's ESIM sequences.",
+    files=FILES,
+    read=read,
+    writer=EsimWriter,
+)

@@ -26,13 +26,14 @@ import numpy as np
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.formats.esim_npz import (
+from enerf_ns.dataparsers.files import of_file, reading
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.robust_enerf import (
     checked_camera,
-    checked_sensor,
     checked_trajectory,
     listed,
     read_views,
-    reading,
+    whole_nanoseconds,
 )
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -77,29 +78,32 @@ def read(folder: Path) -> EventRecording:
     trajectory = _read_trajectory(path, notes)
     camera = _read_camera(path)
     contrast_thresholds, refractory_period, bayer_pattern = None, 0, None
-    if (folder / "esim.conf").exists():
-        contrast_thresholds, refractory_period, bayer_pattern = _read_flags(folder / "esim.conf")
-        if (folder / "esim.conf").stat().st_size == 0:
+    flags_file = folder / "esim.conf"
+    if flags_file.exists():
+        contrast_thresholds, refractory_period, bayer_pattern = _read_flags(flags_file)
+        if flags_file.stat().st_size == 0:
             notes.append("esim.conf is empty, so that contrast thresholds of 1 are used, as the simulator would.")
     else:
         notes.append(
             "There is no esim.conf, so that contrast thresholds and refractory period are not known, and the sensor is "
             "taken to be grey."
         )
-    return EventRecording(
-        path=folder,
-        format="esim_bag",
-        camera=camera,
-        trajectory=trajectory,
-        stream_events=lambda: _stream_events(path),
-        event_files=(path,),
-        held_out_frames=read_views(folder, notes),
-        contrast_thresholds=contrast_thresholds,
-        refractory_period=refractory_period,
-        bayer_pattern=bayer_pattern,
-        notes=tuple(notes),
-        locate_event=lambda index: f"{path}, event {index + 1}",
-    )
+    views = read_views(folder, notes)
+    with of_file(flags_file):
+        return EventRecording(
+            path=folder,
+            format="esim_bag",
+            camera=camera,
+            trajectory=trajectory,
+            stream_events=lambda: _stream_events(path),
+            event_files=(path,),
+            held_out_frames=views,
+            contrast_thresholds=contrast_thresholds,
+            refractory_period=refractory_period,
+            bayer_pattern=bayer_pattern,
+            notes=tuple(notes),
+            locate_event=lambda index: f"{path}, event {index + 1}",
+        )
 
 
 def _messages(path: Path, topic: str) -> Iterator[Any]:
@@ -215,4 +219,13 @@ def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
     if colour is None:
         raise RecordingError(f"{path} holds --{COLOUR}={flags[COLOUR]}, where true or false was expected.")
     on, off, refractory_period = numbers
-    return checked_sensor(path, on, off, refractory_period, "RGGB" if colour else "")
+    return (on, off), whole_nanoseconds(path, refractory_period), "RGGB" if colour else None
+
+
+FORMAT = Format(
+    name="esim_bag",
+    command="esim-bag",
+    description="Events in esim.bag of Robust e-NeRF's simulated sequences.",
+    files=FILES,
+    read=read,
+)

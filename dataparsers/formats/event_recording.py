@@ -3,7 +3,7 @@
     events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
     poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
     recording.json                   camera; and, optional, frame_camera, contrast_thresholds, refractory_period_ns,
-                                     bayer_pattern, depth_range
+                                     bayer_pattern, response, depth_range
     camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure (optional)
@@ -15,36 +15,47 @@ All times are nanoseconds on one clock, from any zero.
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers.camera import Camera, check_rotation
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, load_array
-from enerf_ns.dataparsers.formats.text_tables import parse_array, read_poses, read_times
+from enerf_ns.dataparsers.camera import COEFFICIENTS, Camera, check_rotation
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import load_array, of_file, read_json, write_whole
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.frame_folders import read_frames
+from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
+from enerf_ns.dataparsers.formats.text_tables import read_poses
+from enerf_ns.dataparsers.formats.writer import (
+    CAMERA_KEYS,
+    MOUNTING_KEY,
+    EventFiles,
+    GrowingArray,
+    Writer,
+    camera_json,
+    encode_json,
+    encode_npy,
+    encode_poses,
+    is_second_camera,
+    mounted_camera_json,
+)
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 
-OPTIONAL_KEYS = ("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "depth_range")
-CAMERA_KEYS = ("width", "height", "model", "fx", "fy", "cx", "cy")
-MOUNTING_KEY = "event_camera_from_frame_camera"
-
-COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5), "fisheye": (4,), "lookup": (0,)}
-"""How many numbers the distortion of each camera model may have."""
-
+OPTIONAL_KEYS = (
+    *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
+)
 STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
 LATEST = 2**62
@@ -74,26 +85,28 @@ def read(folder: Path) -> EventRecording:
     if "frame_camera" in about:
         frame_camera, mounting = _parse_frame_camera(path, about["frame_camera"])
         frame_trajectory = trajectory.of_mounted(mounting)
-    num_events = len(columns["t"])
-    return EventRecording(
-        path=folder,
-        format="event_recording",
-        camera=camera,
-        trajectory=trajectory,
-        stream_events=lambda: _stream_events(folder / "events", columns),
-        event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
-        frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, folder / "depth"),
-        blurred_frames=_read_frames(folder / "blurred_frames", frame_camera, frame_trajectory, None),
-        contrast_thresholds=_parse_two(
-            path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
-        ),
-        depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
-        refractory_period=_parse_refractory_period(path, about),
-        bayer_pattern=_parse_bayer_pattern(path, about),
-        notes=tuple(notes),
-        locate_event=lambda index: f"{folder / 'events'}, event {index + 1},",
-        num_events=num_events,
-    )
+    depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
+    with of_file(path):
+        return EventRecording(
+            path=folder,
+            format="event_recording",
+            camera=camera,
+            trajectory=trajectory,
+            stream_events=lambda: _stream_events(folder / "events", columns),
+            event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
+            frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, depth_files),
+            blurred_frames=_read_frames(folder / "blurred_frames", frame_camera, frame_trajectory),
+            contrast_thresholds=_parse_two(
+                path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
+            ),
+            depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
+            refractory_period=_parse_refractory_period(path, about),
+            bayer_pattern=about.get("bayer_pattern"),
+            response=about.get("response"),
+            notes=tuple(notes),
+            locate_event=lambda index: f"{folder / 'events'}, event {index + 1},",
+            num_events=len(columns["t"]),
+        )
 
 
 def write(recording: EventRecording, folder: Path) -> int:
@@ -111,19 +124,14 @@ def write(recording: EventRecording, folder: Path) -> int:
             camera is not fixed to the event camera.
         OSError: The disk is full, or a frame cannot be copied.
     """
-    about: dict[str, object] = {"camera": camera_json(recording.camera)}
     kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
-    for frames in filter(None, kinds.values()):
-        frame_camera = _frame_camera_json(recording, frames)
-        if about.setdefault("frame_camera", frame_camera) != frame_camera:
-            raise RecordingError(
-                f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected."
-            )
-    about["contrast_thresholds"] = recording.contrast_thresholds
-    about["refractory_period_ns"] = recording.refractory_period or None
-    about["bayer_pattern"] = recording.bayer_pattern
-    about["depth_range"] = recording.depth_range
-    write_json(folder / "recording.json", {key: value for key, value in about.items() if value is not None})
+    frame_cameras = [_frame_camera_json(recording, frames) for frames in kinds.values() if frames is not None]
+    if any(camera != frame_cameras[0] for camera in frame_cameras):
+        raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
+    sensor = recording.contrast_thresholds, recording.refractory_period, recording.bayer_pattern, recording.response
+    frame_camera = frame_cameras[0] if frame_cameras else None
+    about = _encode_about(recording.camera, frame_camera, *sensor, depth_range=recording.depth_range)
+    write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
     trajectory = recording.trajectory
@@ -132,11 +140,8 @@ def write(recording: EventRecording, folder: Path) -> int:
         if frames is not None:
             _write_frames(frames, folder / name, folder / "depth")
 
-    def locate(index: int) -> str:
-        return recording.locate_event(index) if recording.locate_event else f"{recording.path}, event {index + 1},"
-
     size = recording.camera.width, recording.camera.height
-    return write_events(recording.stream_events(), folder / "events", *size, locate, recording.num_events)[0]
+    return write_events(recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events)[0]
 
 
 def write_events(
@@ -163,70 +168,38 @@ def write_events(
         RecordingError: There are none, or one lies outside the sensor, goes back in time or has no such polarity.
         OSError: The disk is full.
     """
-    folder.mkdir()
     num_events, last = 0, -LATEST
     columns = (TextColumn("Writing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
-    with ExitStack() as stack:
-        files = {name: stack.enter_context(open(folder / f"{name}.npy", "wb")) for name in STORED_TYPES}
-        for name, file in files.items():
-            file.write(_npy_header(STORED_TYPES[name], 0))
-        with Progress(*columns, transient=True) as progress:
-            task = progress.add_task("", total=total)
-            for events in filter(len, stream):
-                _check_events(events, last, width, height, lambda i, before=num_events: locate(before + i))
-                num_events, last = num_events + len(events), int(events.t[-1])
-                for name, file in files.items():
-                    file.write(getattr(events, name).astype(STORED_TYPES[name]).tobytes())
-                progress.update(task, completed=num_events)
-        for name, file in files.items():
-            file.seek(0)
-            file.write(_npy_header(STORED_TYPES[name], num_events))
+    with closing(_ColumnFiles(folder)) as files, Progress(*columns, transient=True) as progress:
+        task = progress.add_task("", total=total)
+        for events in filter(len, stream):
+            _check_events(events, last, width, height, lambda i, before=num_events: locate(before + i))
+            files.append(events)
+            num_events, last = num_events + len(events), int(events.t[-1])
+            progress.update(task, completed=num_events)
     if num_events == 0:
         raise RecordingError(f"{locate(0)} is missing, since there are no events; give a recording with some.")
     return num_events, last
 
 
-def write_poses(path: Path, times: np.ndarray, positions: np.ndarray, quaternions: np.ndarray) -> None:
+def write_poses(
+    path: Path,
+    times: Int64[np.ndarray, " poses"],
+    positions: Float64[np.ndarray, "poses 3"],
+    quaternions: Float64[np.ndarray, "poses 4"],
+) -> None:
     """Writes poses.txt so that reading it gives the same numbers.
 
     Args:
         path: The file.
-        times: int64 [poses] ns.
-        positions: float64 [poses, 3] metres.
-        quaternions: float64 [poses, 4], xyzw.
-    """
-    with open(path, "w") as file:
-        file.write("# t_ns px py pz qx qy qz qw\n")
-        for time, row in zip(times.tolist(), np.column_stack([positions, quaternions]).tolist(), strict=True):
-            file.write(f"{time} {' '.join(map(repr, row))}\n")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
+        times: ns.
+        positions: Metres.
+        quaternions: xyzw.
 
     Raises:
-        RecordingError: The file is missing or holds no JSON object.
+        OSError: The disk is full.
     """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path} is missing; a JSON file was expected there.") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} cannot be read as JSON ({error}); write it again.") from error
-    if not isinstance(value, dict):
-        raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
-    return value
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Writes recording.json; numbers keep all their digits."""
-    path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-
-
-def camera_json(camera: Camera) -> dict[str, Any]:
-    """A camera as recording.json states it."""
-    about = {key: getattr(camera, key) for key in CAMERA_KEYS}
-    return {**about, "distortion": list(camera.distortion)} if camera.distortion else about
+    write_whole(path, encode_poses("# t_ns px py pz qx qy qz qw", times, positions, quaternions))
 
 
 def parse_camera(path: Path, name: str, value: object, directions_file: Path | None = None) -> Camera:
@@ -243,41 +216,28 @@ def parse_camera(path: Path, name: str, value: object, directions_file: Path | N
     """
     if not isinstance(value, dict):
         raise RecordingError(
-            f"{path} holds {name} = {_short(value)}, but an object with {_list(CAMERA_KEYS)} was expected."
+            f"{path} holds {name} = {shown(value)}, but an object with {_list(CAMERA_KEYS)} was expected."
         )
     _check_keys(path, value, CAMERA_KEYS, ("distortion",), f" in {name}")
-    width, height = (_parse_int(path, f"{name}.{key}", value[key], 1, 65535) for key in ("width", "height"))
-    fx, fy, cx, cy = _numbers(
-        path, name, [value[key] for key in CAMERA_KEYS[3:]], (4,), "numbers fx, fy, cx, cy"
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    lens = parse_numbers(
+        path, f"{name} ({', '.join(names)})", [value[key] for key in names], (6,), "numbers of pixels"
     ).tolist()
-    if not (fx > 0 and fy > 0):
-        raise RecordingError(f"{path} holds the focal lengths {fx:g} and {fy:g}, but they must be above 0 (pixels).")
     model = value["model"]
     models = [known for known in COEFFICIENTS if known != "lookup" or directions_file is not None]
     if model not in models:
-        raise RecordingError(f"{path} holds {name}.model = {_short(model)}, but one of {_list(models)} was expected.")
+        raise RecordingError(f"{path} holds {name}.model = {shown(model)}, but one of {_list(models)} was expected.")
     coefficients = value.get("distortion", [])
-    counts = COEFFICIENTS[model]
-    expected = f"{' or '.join(map(str, counts))} numbers, as the model {model} has,"
-    if not isinstance(coefficients, list) or len(coefficients) not in counts:
-        raise RecordingError(f"{path} holds {name}.distortion = {_short(coefficients)}, but {expected} were expected.")
-    if coefficients:
-        coefficients = _numbers(path, f"{name}.distortion", coefficients, (len(coefficients),), expected).tolist()
-    camera = Camera(width, height, fx, fy, cx, cy, tuple(coefficients), model)
-    if model == "lookup":
-        assert directions_file is not None
-        directions = load_array(directions_file)
-        if directions.shape != (height, width, 2) or not np.isfinite(directions).all():
-            raise RecordingError(
-                f"{directions_file} holds an array of shape {directions.shape}, but finite numbers of shape "
-                f"(height, width, 2) = {(height, width, 2)} were expected."
-            )
-        camera = replace(camera, directions=directions.astype(np.float64))
-    try:
-        camera.pixel_directions()
-    except ValueError as error:
-        raise RecordingError(f"{path} holds a {name} that fits no lens: {error}.") from error
-    return camera
+    shape = (len(coefficients) if isinstance(coefficients, list) else 0,)
+    distortion = parse_numbers(path, f"{name}.distortion", coefficients, shape, "numbers").tolist()
+    if model != "lookup":
+        with of_file(f"{path}, {name},"):
+            return Camera(*lens, tuple(distortion), model)
+    assert directions_file is not None
+    with of_file(f"{path}, {name},"):
+        undistorted = Camera(*lens, tuple(distortion))
+    with of_file(directions_file):
+        return replace(undistorted, model="lookup", directions=load_array(directions_file).astype(np.float64))
 
 
 def _open_columns(folder: Path) -> dict[str, np.memmap]:
@@ -344,12 +304,6 @@ def _check_events(events: Events, last: int, width: int, height: int, locate: Ca
         )
 
 
-def _npy_header(dtype: type, length: int) -> bytes:
-    """Of a .npy file with one column, always 128 bytes, so that the length can be filled in at the end."""
-    header = f"{{'descr': '{np.dtype(dtype).str}', 'fortran_order': False, 'shape': ({length},), }}"
-    return b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little") + header.ljust(117).encode() + b"\n"
-
-
 def read_cameras(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
     """The camera of the events, that of the frames, and the pose of the latter in the axes of the former.
 
@@ -373,7 +327,7 @@ def _parse_frame_camera(path: Path, value: object) -> tuple[Camera, Float64[np.n
     if not isinstance(value, dict) or MOUNTING_KEY not in value:
         return parse_camera(path, "frame_camera", value), np.eye(4)
     name = f"frame_camera.{MOUNTING_KEY}"
-    mounting = _numbers(path, name, value[MOUNTING_KEY], (4, 4), "a matrix of 4 x 4 numbers")
+    mounting = parse_numbers(path, name, value[MOUNTING_KEY], (4, 4), "a matrix of 4 x 4 numbers")
     try:
         check_rotation(mounting[:3, :3])
     except ValueError as error:
@@ -384,6 +338,28 @@ def _parse_frame_camera(path: Path, value: object) -> tuple[Camera, Float64[np.n
         )
     camera = {key: item for key, item in value.items() if key != MOUNTING_KEY}
     return parse_camera(path, "frame_camera", camera), mounting
+
+
+def _encode_about(
+    camera: Camera,
+    frame_camera: dict[str, Any] | None,
+    contrast_thresholds: tuple[float, float] | None,
+    refractory_period: int,
+    bayer_pattern: str | None,
+    response: str | None = None,
+    depth_range: tuple[float, float] | None = None,
+) -> bytes:
+    """recording.json, in which what is not known is left out."""
+    about = {
+        "camera": camera_json(camera),
+        "frame_camera": frame_camera,
+        "contrast_thresholds": contrast_thresholds,
+        "refractory_period_ns": refractory_period or None,
+        "bayer_pattern": bayer_pattern,
+        "response": response,
+        "depth_range": depth_range,
+    }
+    return encode_json({key: value for key, value in about.items() if value is not None})
 
 
 def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, Any] | None:
@@ -405,37 +381,15 @@ def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, A
             f"{recording.path} holds frames of a camera with a table of directions, but this layout has such a table "
             "for the event camera alone."
         )
-    return {**camera_json(frames.camera), MOUNTING_KEY: [*mountings[0].tolist(), [0.0, 0.0, 0.0, 1.0]]}
+    return mounted_camera_json(frames.camera, np.vstack([mountings[0], [0.0, 0.0, 0.0, 1.0]]))
 
 
-def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, depth_folder: Path | None) -> Frames | None:
-    stamps_file = folder / "stamps_ns.txt"
+def _read_frames(
+    folder: Path, camera: Camera, trajectory: Trajectory, depth_files: Sequence[Path] = ()
+) -> Frames | None:
     kinds = Image.registered_extensions()
-    files = tuple(sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds))
-    if not files and not stamps_file.exists():
-        return None
-    times = read_times(stamps_file, "ns")
-    if len(times) != len(files):
-        raise RecordingError(
-            f"{folder} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; give one each."
-        )
-    for file in files:
-        check_image_size(file, camera.width, camera.height)
-    depth_files = tuple(sorted(depth_folder.glob("[!.]*.npy"))) if depth_folder else ()
-    if not depth_files:
-        return Frames(files, times, camera, trajectory)
-    if len(depth_files) != len(files):
-        raise RecordingError(
-            f"{depth_folder} holds {len(depth_files)} depth maps, but {folder} holds {len(files)} images."
-        )
-    for file in depth_files:
-        shape = load_array(file, mmap_mode="r").shape
-        if shape != (camera.height, camera.width):
-            raise RecordingError(
-                f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
-                f"{(camera.height, camera.width)}."
-            )
-    return Frames(files, times, camera, trajectory, depth_files)
+    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
+    return read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files)
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
@@ -466,45 +420,96 @@ def _check_keys(path: Path, value: dict, required: tuple[str, ...], optional: tu
 def _parse_two(path: Path, about: dict, name: str, expected: str) -> tuple[float, float] | None:
     if name not in about:
         return None
-    first, second = _numbers(path, name, about[name], (2,), expected).tolist()
-    if not (first > 0 and second > 0) or (name == "depth_range" and first >= second):
-        raise RecordingError(f"{path} holds {name} = {_short(about[name])}, but {expected} were expected.")
+    first, second = parse_numbers(path, name, about[name], (2,), expected).tolist()
     return first, second
 
 
 def _parse_refractory_period(path: Path, about: dict) -> int:
-    return _parse_int(path, "refractory_period_ns", about.get("refractory_period_ns", 0), 0, 10**12)
-
-
-def _parse_bayer_pattern(path: Path, about: dict) -> str | None:
-    pattern = about.get("bayer_pattern")
-    if pattern is not None and not (isinstance(pattern, str) and len(pattern) == 4 and set(pattern) <= set("RGB")):
+    period = about.get("refractory_period_ns", 0)
+    if type(period) is not int:
         raise RecordingError(
-            f"{path} holds bayer_pattern = {_short(pattern)}, but the colours of the pixels (0, 0), (1, 0), (0, 1) and "
-            "(1, 1) were expected, such as RGGB."
+            f"{path} holds refractory_period_ns = {shown(period)}, but a whole number of nanoseconds was expected."
         )
-    return pattern
-
-
-def _parse_int(path: Path, name: str, value: object, smallest: int, largest: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not smallest <= value <= largest:
-        raise RecordingError(
-            f"{path} holds {name} = {_short(value)}, but a whole number from {smallest} to {largest} was expected."
-        )
-    return value
-
-
-def _numbers(path: Path, name: str, value: object, shape: tuple[int, ...], expected: str) -> Float64[np.ndarray, "..."]:
-    try:
-        return parse_array(value, shape)
-    except ValueError as error:
-        raise RecordingError(f"{path} holds {name} = {_short(value)}, but {expected} were expected.") from error
+    return period
 
 
 def _list(names: tuple[str, ...] | list[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def _short(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+class EventRecordingWriter(Writer):
+    """This project's own layout."""
+
+    layout = "event_recording"
+
+    def _check(self) -> None:
+        if self.setup.frame_camera.model == "lookup":
+            raise FlagError(
+                "The layout event_recording holds no table of directions for the frame camera; give its distortion."
+            )
+
+    def _write_calibration(self) -> None:
+        if self.setup.event_camera.directions is not None:
+            self._replace("camera_directions.npy", encode_npy(self.setup.event_camera.directions, np.float64))
+        self._write_about()
+
+    def _write_about(self) -> None:
+        setup = self.setup
+        rig = setup.event_camera, setup.frame_camera, setup.event_from_frame
+        frame_camera = mounted_camera_json(*rig[1:]) if is_second_camera(*rig) else None
+        sensor = setup.contrast_thresholds, setup.refractory_period, setup.bayer_pattern
+        self._replace("recording.json", _encode_about(rig[0], frame_camera, *sensor, depth_range=self.depth_range))
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        write_poses(self.folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
+
+    def _open_events(self) -> EventFiles:
+        return _ColumnFiles(self.folder / "events")
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        images = {f"frames/{self._name(number)}.png": sharp}
+        if blurred is not None:
+            images[f"blurred_frames/{self._name(number)}.png"] = blurred
+        return images
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        folders = ("frames", "blurred_frames") if self.setup.exposure else ("frames",)
+        return {f"{folder}/stamps_ns.txt": f"{time}\n" for folder in folders}
+
+    def _write_summary(self, finished: bool) -> None:
+        if self.depth_range is not None:
+            self._write_about()
+        super()._write_summary(finished)
+
+
+class _ColumnFiles:
+    """x.npy, y.npy, t.npy and p.npy."""
+
+    def __init__(self, folder: Path):
+        self._files = {name: GrowingArray(folder / f"{name}.npy", dtype) for name, dtype in STORED_TYPES.items()}
+        self._num_events = 0
+
+    def append(self, events: Events) -> None:
+        for name, file in self._files.items():
+            file.append(getattr(events, name))
+        self._num_events += len(events)
+        self._commit()
+
+    def close(self) -> None:
+        self._commit()
+        for file in self._files.values():
+            file.close()
+
+    def _commit(self) -> None:
+        for file in self._files.values():
+            file.commit(self._num_events)
+
+
+FORMAT = Format(
+    name="event_recording",
+    command="event-recording",
+    description="Events in the folder layout of enerf-ns, from any camera.",
+    files=FILES,
+    read=read,
+    writer=EventRecordingWriter,
+)

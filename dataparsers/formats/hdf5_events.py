@@ -10,15 +10,17 @@ The columns lie in the group events/ or at the root. Rectify maps, which come be
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32
 
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import reading, write_all
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events
 
 if TYPE_CHECKING:
@@ -31,6 +33,9 @@ LATEST = 2**62 // 1000
 
 BLOSC_FILTERS, BLOSC_PARAMETERS = (32001, 32026), 4
 """Blosc and Blosc2, which end the process where they find fewer parameters in a damaged file."""
+
+METADATA_BYTES = 2**17
+"""By which a file that is written may grow beside its events at a time."""
 
 SMALLEST_CACHE = 2**20
 """Bytes for chunks that were decompressed and are not yet used up."""
@@ -58,7 +63,7 @@ class Hdf5Events:
     def __init__(self, path: Path):
         self.path = path
         self._cache = SMALLEST_CACHE
-        with _reading(path, "events"), self._open() as file:
+        with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
             self._check(columns)
             self._offset = self._read_offset(file)
@@ -76,14 +81,14 @@ class Hdf5Events:
         Raises:
             RecordingError: The file cannot be read any more, or has fewer events than before.
         """
-        with _reading(self.path, "events"):
+        with reading(self.path, "an HDF5 file with events"):
             file = self._open()
         with file:
-            with _reading(self.path, "events"):
+            with reading(self.path, "an HDF5 file with events"):
                 columns = self._columns(file)
             for start in range(0, self.num_events, EVENTS_AT_A_TIME):
                 stop = min(start + EVENTS_AT_A_TIME, self.num_events)
-                with _reading(self.path, f"events {start + 1:,} to {stop:,}"):
+                with reading(self.path, f"an HDF5 file with events {start + 1:,} to {stop:,}"):
                     x, y, p = (columns[name][start:stop] for name in ("x", "y", "p"))
                     t = self._times(columns["t"], start, stop, zero)
                 if not len(x) == len(y) == len(t) == len(p) == stop - start:
@@ -173,7 +178,7 @@ def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray,
     import h5py
     import hdf5plugin  # noqa: F401  makes the filters known
 
-    with _reading(path, "a rectify map"), h5py.File(path, "r", locking=False) as file:
+    with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
         dataset = file.get("rectify_map")
         if not isinstance(dataset, h5py.Dataset):
             raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
@@ -217,20 +222,82 @@ def _chunk_bytes(dataset: h5py.Dataset) -> int:
     return dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks else 0
 
 
-@contextmanager
-def _reading(path: Path, what: str) -> Iterator[None]:
-    """Turns errors of the HDF5 library into one sentence about the file."""
-    try:
-        yield
-    except UserError:
-        raise
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path} is missing; an HDF5 file with {what} was expected there.") from error
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
-        if path.is_file() and path.stat().st_size == 0:
-            raise RecordingError(f"{path} is empty; an HDF5 file with {what} was expected.") from error
-        lines = str(error).strip("\"'").splitlines()
-        reason = lines[0].rstrip(".") if lines else type(error).__name__
-        raise RecordingError(
-            f"{path} cannot be read as an HDF5 file with {what} ({reason}); copy it again from its source."
-        ) from error
+class Hdf5EventsFile:
+    """x, y, t (whole microseconds) and p (0 or 1); if in a group, also ms_to_idx: each millisecond's first event.
+
+    Only whole chunks are added until the file is closed, since one that is rewritten as it grows may end up in place
+    of another that the file on the disk still refers to. The room that an addition needs is taken from the disk before
+    it is made, since a file whose addition fails halfway cannot be read any more. The oldest version of the file format
+    is used, in which a file is not marked as open.
+
+    Args:
+        path: The file, which is made anew.
+        group: "events/", or "" for the root.
+        filters: Of h5py's `create_dataset`.
+        to_us: From times (ns) to the microseconds that the file shall hold.
+        chunk: Events that are compressed, and written, together.
+    """
+
+    def __init__(self, path: Path, group: str, filters: dict, to_us: Callable[[np.ndarray], np.ndarray], chunk: int):
+        import h5py
+
+        self._path, self._to_us, self._chunk = path, to_us, chunk
+        self._file = h5py.File(path, "w", libver=("earliest", "v108"), rdcc_nbytes=0)
+        self._reserve(0)
+        make = partial(self._file.create_dataset, shape=(0,), maxshape=(None,))
+        types = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
+        options = {"chunks": (chunk,), **filters}
+        self._columns = {name: make(group + name, dtype=dtype, **options) for name, dtype in types.items()}
+        self._milliseconds = make("ms_to_idx", dtype=np.uint64, chunks=(1024,)) if group else None
+        self._file.flush()
+        self._num_events, self._next_millisecond = 0, 0
+        self._rest = {name: np.zeros(0, dtype) for name, dtype in types.items()}
+
+    def append(self, events: Events) -> None:
+        new = {"x": events.x, "y": events.y, "t": self._to_us(events.t), "p": events.p > 0}
+        for name, column in new.items():
+            self._rest[name] = np.concatenate([self._rest[name], column.astype(self._rest[name].dtype)])
+        self._add(len(self._rest["t"]) // self._chunk * self._chunk)
+
+    def close(self) -> None:
+        try:
+            for column in self._columns.values():  # of which some may have grown before an interruption
+                column.resize((self._num_events,))
+            if self._milliseconds is not None:
+                self._milliseconds.resize((self._next_millisecond,))
+            self._add(len(self._rest["t"]))
+        finally:
+            length = self._file.id.get_filesize()
+            self._file.close()
+            os.truncate(self._path, length)
+
+    def _add(self, count: int) -> None:
+        """Adds the first events of those held back."""
+        if not count:
+            return
+        times, indices = self._rest["t"][:count], np.zeros(0, np.int64)
+        if self._milliseconds is not None:
+            milliseconds = np.arange(self._next_millisecond, times[-1] // 1000 + 1)
+            indices = self._num_events + np.searchsorted(times, 1000 * milliseconds)
+        self._reserve(sum(column[:count].nbytes for column in self._rest.values()) + indices.nbytes)
+        for name, column in self._columns.items():
+            column.resize((self._num_events + count,))
+            column[self._num_events :] = self._rest[name][:count]
+        if self._milliseconds is not None:
+            self._milliseconds.resize((self._next_millisecond + len(indices),))
+            self._milliseconds[self._next_millisecond :] = indices
+        self._file.flush()
+        self._num_events += count
+        self._next_millisecond += len(indices)
+        self._rest = {name: column[count:] for name, column in self._rest.items()}
+
+    def _reserve(self, num_bytes: int) -> None:
+        """Makes the file so much longer than the library knows; what lies behind its end it uses as it needs it."""
+        end = self._file.id.get_filesize() + num_bytes + METADATA_BYTES
+        with open(self._path, "r+b", buffering=0) as file:
+            length = file.seek(0, os.SEEK_END)
+            try:
+                write_all(file, bytes(max(end - length, 0)))
+            except OSError:
+                file.truncate(length)
+                raise

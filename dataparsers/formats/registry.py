@@ -1,18 +1,55 @@
 """Which formats there are, and which one a folder has.
 
-A format is a module with `FILES`, the glob patterns that its folders are recognised by, and `read(folder)`; adding one
-means writing that module and naming it in `FORMATS`.
+A format is a module that defines a `Format`; adding one means writing that module and naming it in the line below
+`_FORMATS`, or, outside of this package, calling `register`. For a sub-command of `ns-train`, it is then to be named as
+an entry point (nerfstudio.dataparser_configs) too.
 """
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import of_file
+from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording import EventRecording
+
+_FORMATS: dict[str, Format] = {}
+
+
+def register(format: Format) -> None:
+    """Makes a format known: it is found out from folders, and can be named.
+
+    Args:
+        format: Its name and its command are those of no other.
+
+    Raises:
+        ValueError: They are.
+    """
+    taken = {name for known in formats() for name in (known.name, known.command)}
+    if format.name in taken or format.command in taken or format.name == "auto":
+        raise ValueError(f"There is a format {format.name} or {format.command} already; give this one other names.")
+    _FORMATS[format.name] = format
+
+
+def formats() -> tuple[Format, ...]:
+    """All formats, in the order in which they were registered."""
+    return tuple(_FORMATS.values())
+
+
+def format_named(name: str) -> Format:
+    """The format of this name.
+
+    Raises:
+        FlagError: There is none.
+    """
+    if name not in _FORMATS:
+        raise FlagError(f"The format {name!r} is not known; give one of {', '.join(_FORMATS)}, or auto to find out.")
+    return _FORMATS[name]
 
 
 def read_recording(
@@ -26,19 +63,52 @@ def read_recording(
 
     Args:
         path: Folder of the recording; never written to.
-        format: A name of `FORMATS`, or "auto" to find out.
+        format: Name of a registered format, or "auto" to find out.
         time_range: As of `EventRecording.selected`.
         keep_hot_pixels: As of `EventRecording.selected`.
-        options: Of the format's reader.
+        options: Of the format, by name; those left out have its defaults.
 
     Raises:
         RecordingError: The folder is of no known format, or anything in it cannot be used.
+        FlagError: There is no such format, it lacks an option, or the range of time holds no poses.
     """
     return _read_recording(Path(path).resolve(), format, time_range, keep_hot_pixels, **options)
 
 
-FORMATS = ("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "event_recording")
-"""Names of the formats, which are those of their readers' modules."""
+def layouts() -> tuple[str, ...]:
+    """Names of the formats that can be written."""
+    return tuple(format.name for format in formats() if format.writer is not None)
+
+
+def writer_of(layout: str) -> type[Writer]:
+    """The class that writes a layout.
+
+    Raises:
+        FlagError: There is none.
+    """
+    writer = format_named(layout).writer
+    if writer is None:
+        raise FlagError(f"The layout {layout} can only be read; give one of {', '.join(layouts())}.")
+    return writer
+
+
+def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
+    """Begins a recording, to be used in a `with` statement at whose end the recording is finished.
+
+    Args:
+        layout: One of `layouts`.
+        folder: Exists and is empty.
+        setup: What is recorded.
+
+    Raises:
+        FlagError: The layout cannot hold these cameras or that few frames, or the extrinsics are no rigid motion.
+        OutputError: The disk is full.
+    """
+    return writer_of(layout)(folder, setup)
+
+
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
+    register(_module.FORMAT)
 
 
 @cache
@@ -47,20 +117,29 @@ def _read_recording(path: Path, format: str, time_range, keep_hot_pixels: bool, 
         raise RecordingError(f"{path} does not exist; give the folder of a recording.")
     if not path.is_dir():
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
-    reader = import_module(f"enerf_ns.dataparsers.formats.{_find_format(path) if format == 'auto' else format}")
+    found = _find_format(path) if format == "auto" else format_named(format)
+    _check_options(path, found, options)
     with of_file(path):
-        recording = reader.read(path, **options)
+        recording = found.read(path, **options)
     return recording.selected(time_range, keep_hot_pixels)
 
 
-def _find_format(path: Path) -> str:
+def _check_options(path: Path, found: Format, options: dict[str, object]) -> None:
+    for option in options:
+        having = [format.name for format in formats() if option in (field.name for field in fields(format.options))]
+        if found.name not in having:
+            flag = f"--{option.replace('_', '-')}"
+            whose = f"is for recordings of {' and '.join(having)}" if having else "is no option of any format"
+            raise FlagError(f"{flag} {whose}, but {path} is read as {found.name}; leave it out.")
+
+
+def _find_format(path: Path) -> Format:
     """Of the formats, the one most of whose files lie in a folder."""
-    readers = {name: import_module(f"enerf_ns.dataparsers.formats.{name}") for name in FORMATS}
-    found = {name: sum(any(path.glob(pattern)) for pattern in reader.FILES) for name, reader in readers.items()}
-    best = [name for name, count in found.items() if count == max(found.values())]
+    found = {format: sum(any(path.glob(pattern)) for pattern in format.files) for format in formats()}
+    best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) == 1:
         return best[0]
-    looked_for = "; ".join(f"for {name}: {', '.join(reader.FILES)}" for name, reader in readers.items())
+    looked_for = "; ".join(f"for {format.name}: {', '.join(format.files)}" for format in formats())
     names = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     listed = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     raise RecordingError(

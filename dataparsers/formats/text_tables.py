@@ -96,24 +96,6 @@ def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Floa
     return values
 
 
-def parse_array(value: object, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-    """Finite numbers of this shape from nested lists of JSON.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    array = np.array(value, dtype=object)
-    if array.shape != shape or not all(type(number) in (int, float) for number in array.flat):
-        raise ValueError(f"{shape} numbers were expected")
-    try:
-        numbers = array.astype(np.float64)
-    except OverflowError as error:
-        raise ValueError("a number is too large") from error
-    if not np.isfinite(numbers).all():
-        raise ValueError("finite numbers were expected")
-    return numbers
-
-
 def read_times(path: Path, unit: str) -> Int64[np.ndarray, " rows"]:
     """One time a line, in nanoseconds; errors as of `parse_times`."""
     rows, numbers = read_rows(path, f"t_{unit}")

@@ -1,4 +1,4 @@
-"""Reader for TUM-VIE: two event cameras, two cameras of grey frames, and motion capture.
+"""Reader and writer of TUM-VIE: two event cameras, two cameras of grey frames, and motion capture.
 
 As it is unpacked, for the left event camera; the right one has files of its own:
 
@@ -36,8 +36,7 @@ https://vision.in.tum.de/data/datasets/visual-inertial-event-dataset.
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -47,9 +46,10 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import image_size
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import image_size, of_file, read_json
+from enerf_ns.dataparsers.formats.format import Format, FormatOptions
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.text_tables import (
     QUATERNION_TOLERANCE,
     parse_numbers,
@@ -57,7 +57,8 @@ from enerf_ns.dataparsers.formats.text_tables import (
     read_rows,
     read_times,
 )
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json, encode_poses, poses_at
+from enerf_ns.dataparsers.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/mocap_data.txt", "calib_undist.json")
@@ -88,8 +89,8 @@ PUBLISHED_EXTRINSICS = np.array(
 """Pose of the left frame camera in the axes of the left event camera, metres; these three are of camera-calibrationA,
 with which mocap-desk and mocap-desk2 were recorded."""
 
-POSES_PER_SECOND = 120
-"""Of the motion capture."""
+WRITTEN_SEQUENCE = "simulated"
+"""What the files of a recording that is written are named after."""
 
 SEQUENCES = {
     "A": ("loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"),
@@ -102,20 +103,22 @@ SEQUENCES = {
 
 CALIBRATIONS = ("camera-calibration", "mocap-imu-calibration")
 
-LARGEST_SPAN_RATIO = 100
-"""Between the spans of frames and poses; units of time differ by 1000."""
-
 SHORTEST_STEP = 100_000
 """Nanoseconds between frames or poses."""
 
 LONGEST_GAP = 200_000_000
 """Nanoseconds between poses that interpolation may bridge."""
 
-LENS_STEP = 16
-"""Pixels between those at which it is checked that a lens can be."""
-
 BALANCE_TOLERANCE = 1.0
 """Pixels by which intrinsics may differ from those that OpenCV gives; its versions differ by less."""
+
+
+@dataclass(frozen=True)
+class TumVieOptions(FormatOptions):
+    """What is read of a recording."""
+
+    event_camera: Literal["left", "right"] = "left"
+    """Which of the two event cameras, with the frame camera beside it."""
 
 
 @dataclass(frozen=True)
@@ -341,7 +344,8 @@ def _read_prepared_rig(folder: Path, side: str, sequence: str, frame_files: tupl
     fx, fy, cx, cy = _matrix(path, calibration, 2 + index)
     rectify_map = read_rectify_map(_find_one(folder, f"*rectify_map_{side}.h5", "a rectify map"), *SENSOR_SIZE)
     directions = (rectify_map.astype(np.float64) - [cx, cy]) / [fx, fy]
-    camera = Camera(*SENSOR_SIZE, fx, fy, cx, cy, model="lookup", directions=directions)
+    with of_file(f"{path}, intrinsics_undistorted[{2 + index}],"):
+        camera = Camera(*SENSOR_SIZE, fx, fy, cx, cy, model="lookup", directions=directions)
     _check_principal_point(path, camera, "the event camera")
     if has_raw:
         _check_size(raw_path, _fisheye(raw_path, raw, 2 + index), SENSOR_SIZE, "the event camera")
@@ -350,7 +354,8 @@ def _read_prepared_rig(folder: Path, side: str, sequence: str, frame_files: tupl
     if frame_files:
         lens = _fisheye(raw_path, raw, index) if has_raw else None
         width, height = (lens.width, lens.height) if lens is not None else image_size(frame_files[0])
-        frame_camera = Camera(width, height, *_matrix(path, calibration, index))
+        with of_file(f"{path}, intrinsics_undistorted[{index}],"):
+            frame_camera = Camera(width, height, *_matrix(path, calibration, index))
         _check_images(raw_path, frame_camera, frame_files)
         _check_principal_point(path, frame_camera, "the frames")
         if lens is not None:
@@ -410,14 +415,8 @@ def _check_principal_point(path: Path, camera: Camera, what: str) -> None:
 
 
 def _read_calibration(path: Path) -> dict:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path} is missing; a calibration of TUM-VIE (JSON) was expected there.") from error
-    except (OSError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise RecordingError(f"{path} cannot be read as JSON ({reason}); copy it again from its source.") from error
-    if not isinstance(content, dict) or not isinstance(content.get("value0"), dict):
+    content = read_json(path)
+    if not isinstance(content.get("value0"), dict):
         raise RecordingError(f"{path} holds no object value0, but a calibration of TUM-VIE was expected.")
     return content["value0"]
 
@@ -440,10 +439,8 @@ def _numbers(path: Path, entry: dict, names: str, what: str) -> list[float]:
 
 
 def _matrix(path: Path, calibration: dict, index: int) -> tuple[float, float, float, float]:
-    what = f"intrinsics_undistorted[{index}]"
     entry = _entry(path, calibration, "intrinsics_undistorted", index)
-    fx, fy, cx, cy = _numbers(path, entry, "fx fy cx cy", what)
-    _check_focal_lengths(path, fx, fy, what)
+    fx, fy, cx, cy = _numbers(path, entry, "fx fy cx cy", f"intrinsics_undistorted[{index}]")
     return fx, fy, cx, cy
 
 
@@ -454,30 +451,14 @@ def _fisheye(path: Path, calibration: dict, index: int) -> Camera:
         raise RecordingError(f"{path} holds a camera of type {model!r} as intrinsics[{index}], but kb4 was expected.")
     what = f"intrinsics[{index}]"
     fx, fy, cx, cy, *distortion = _numbers(path, parameters, "fx fy cx cy k1 k2 k3 k4", what)
-    _check_focal_lengths(path, fx, fy, what)
     sizes = calibration.get("resolution")
     size = sizes[index] if isinstance(sizes, list) and len(sizes) == 4 else None
-    if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int and 0 < side < 2**16 for side in size)):
+    if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int for side in size)):
         raise RecordingError(
             f"{path} holds resolution[{index}] = {size}, but width and height in pixels were expected."
         )
-    camera = Camera(size[0], size[1], fx, fy, cx, cy, tuple(distortion), "fisheye")
-    columns, rows = size[0] // LENS_STEP + 1, size[1] // LENS_STEP + 1
-    fx, fy, cx, cy = fx / LENS_STEP, fy / LENS_STEP, cx / LENS_STEP, cy / LENS_STEP
-    try:
-        replace(camera, width=columns, height=rows, fx=fx, fy=fy, cx=cx, cy=cy).pixel_directions()
-    except ValueError as error:
-        raise RecordingError(
-            f"{path} fits no lens as {what}, tried at every {LENS_STEP} pixels: {error}; copy it again from its source."
-        ) from error
-    return camera
-
-
-def _check_focal_lengths(path: Path, fx: float, fy: float, what: str) -> None:
-    if fx <= 0 or fy <= 0:
-        raise RecordingError(
-            f"{path} holds the focal lengths {fx:g} and {fy:g} as {what}, but they must be above 0 (pixels)."
-        )
+    with of_file(f"{path}, {what},"):
+        return Camera(size[0], size[1], fx, fy, cx, cy, tuple(distortion), "fisheye")
 
 
 def _mount(path: Path, calibration: dict, index: int) -> Float64[np.ndarray, "4 4"]:
@@ -515,3 +496,87 @@ def _read_marker(path: Path, published: str) -> Float64[np.ndarray, "4 4"]:
             f"{path} {found} states no T_imu_marker; replace it by {published}, published with the data set."
         )
     return _pose(path, entry, "T_imu_marker")
+
+
+class TumVieWriter(Writer):
+    """TUM-VIE as it is unpacked: its left cameras. Markers, IMU and event camera are in one place."""
+
+    layout = "tum_vie"
+    poses_per_second = 120
+    published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_FRAME_CAMERA, PUBLISHED_EXTRINSICS)
+
+    def _check(self) -> None:
+        self._check_size(SENSOR_SIZE)
+        for camera in (self.setup.event_camera, self.setup.frame_camera):
+            if camera.model != "fisheye":
+                raise FlagError(
+                    f"The layout tum_vie holds cameras of the model fisheye, but one of {camera.model} was asked for; "
+                    "choose such a camera or another layout."
+                )
+
+    def _write_calibration(self) -> None:
+        setup = self.setup
+        cameras = [setup.frame_camera] * 2 + [setup.event_camera] * 2
+        names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+        lenses = [(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion) for camera in cameras]
+        calibration = {
+            "T_imu_cam": [_pose_json(setup.event_from_frame)] * 2 + [_pose_json(np.eye(4))] * 2,
+            "intrinsics": [
+                {"camera_type": "kb4", "intrinsics": dict(zip(names, lens, strict=True))} for lens in lenses
+            ],
+            "resolution": [[camera.width, camera.height] for camera in cameras],
+        }
+        self._replace("camera-calibrationA.json", encode_json({"value0": calibration}))
+        marker = {"value0": {"T_imu_marker": _pose_json(np.eye(4))}}
+        self._replace("mocap-imu-calibrationA.json", encode_json(marker))
+        self._replace(
+            f"{self._data}/right_images/image_timestamps_right.txt", b""
+        )  # without which E-NeRF does not load
+
+    def _write_poses(self, trajectory: Trajectory) -> None:
+        times = np.unique(self._to_us(trajectory.times))
+        header = "# timestamp[us] px py pz qx qy qz qw"
+        content = encode_poses(header, times.tolist(), *poses_at(trajectory, times * 1000))
+        self._replace(f"{self._data}/mocap_data.txt", content)
+
+    def _open_events(self) -> EventFiles:
+        import hdf5plugin
+
+        path = self.folder / f"{WRITTEN_SEQUENCE}-events_left.h5"
+        return Hdf5EventsFile(path, "events/", dict(hdf5plugin.Blosc("zstd")), self._to_us, self.events_held)
+
+    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
+        path = f"{self._data}/left_images/{self._name(number)}.png"
+        if blurred is None:
+            return {path: sharp}
+        return {path: blurred, f"sharp_images/{self._name(number)}.png": sharp}
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        """Exposures begin at the stamps, which are such that their middles are closest to the frames' times."""
+        exposure = round(self.setup.exposure / 1000)
+        stamp = (2 * time - 1000 * exposure + 1000) // 2000
+        folder = f"{self._data}/left_images"
+        return {
+            f"{folder}/image_timestamps_left.txt": f"{stamp}\n",
+            f"{folder}/image_exposures_left.txt": f"{exposure}\n",
+        }
+
+    @property
+    def _data(self) -> str:
+        return f"{WRITTEN_SEQUENCE}-vi_gt_data"
+
+
+def _pose_json(pose: np.ndarray) -> dict[str, float]:
+    values = [*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()]
+    return dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), values, strict=True))
+
+
+FORMAT = Format(
+    name="tum_vie",
+    command="tumvie-events",
+    description="Events of TUM-VIE, as published or prepared by E-NeRF's reference code.",
+    files=FILES,
+    read=read,
+    options=TumVieOptions,
+    writer=TumVieWriter,
+)

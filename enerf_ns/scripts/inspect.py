@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -13,6 +13,7 @@ from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import Inspection
+from enerf_ns.scripts.format_options import format_flags
 
 CONSOLE = Console(width=120)
 
@@ -25,8 +26,7 @@ class Inspect:
     """Folder of the recording. It is only ever read."""
     output: Path | None = None
     """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
-    event_camera: Literal["left", "right"] | None = None
-    """Which of TUM-VIE's two event cameras. None: left."""
+    options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 
     def main(self) -> None:
         data = self.data.expanduser().resolve()
@@ -37,15 +37,10 @@ class Inspect:
             raise OutputError(
                 f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
             )
-        if self.event_camera is None:
-            recording = read_recording(data)
-        else:
-            recording = read_recording(data, "tum_vie", event_camera=self.event_camera)
-        inspection = Inspection.of(recording)
+        inspection = Inspection.of(read_recording(data, **self.options.given()))
         inspection.print_tables(CONSOLE)
         page = inspection.page()
         try:
-            output.parent.mkdir(parents=True, exist_ok=True)
             write_whole(output, page)
         except OSError as error:
             reason = f"could not be written ({error.strerror})"

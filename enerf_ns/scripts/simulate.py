@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional  # tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
@@ -21,13 +21,14 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.formats import eds, tum_vie
 from enerf_ns.dataparsers.formats.event_recording import read_cameras
+from enerf_ns.dataparsers.formats.registry import layouts, open_writer, writer_of
+from enerf_ns.dataparsers.formats.writer import Setup, Writer, is_second_camera
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.sensor.response import ColourFilter, luma, pixel_brightness
+from enerf_ns.sensor.response import ColourFilter, Logarithm, luma, pixel_brightness
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
-from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings
+from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings, develop
 from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
 from enerf_ns.simulator.preview import Preview
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, Render, adaptive_renders, render_times
@@ -37,7 +38,6 @@ from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.scene.view_check import check_view
 from enerf_ns.simulator.sources import ImageFolder, Pictures, RenderedScene, Source, TrainedRun, Video
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
-from enerf_ns.simulator.writers import FEWEST_ESIM_FRAMES, Setup, Writer, is_second_camera, open_writer
 
 CONSOLE = Console(width=120)
 
@@ -55,11 +55,10 @@ MOST_PIXELS = 2**24
 SPARSE = 20_000_000
 """Nanoseconds between poses, above which they are made denser where a second camera is mounted on the first."""
 
-PUBLISHED_RIGS = {
-    "eds": (eds.PUBLISHED_EVENT_CAMERA, eds.PUBLISHED_RGB_CAMERA, eds.PUBLISHED_EXTRINSICS),
-    "tum_vie": (tum_vie.PUBLISHED_EVENT_CAMERA, tum_vie.PUBLISHED_FRAME_CAMERA, tum_vie.PUBLISHED_EXTRINSICS),
-}
-"""Cameras of events and of frames, and the pose of the latter in the axes of the former, of layouts that have some."""
+if TYPE_CHECKING:
+    Layout = str
+else:
+    Layout = Literal[layouts()]
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class Simulate:
     """Horizontal, in degrees. None: as the preset or the run, or 60."""
     cameras: Optional[Path] = None  # noqa: UP045
     """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
-    layout: Optional[Literal["esim", "eds", "tum_vie", "event_recording"]] = None  # noqa: UP045
+    layout: Optional[Layout] = None  # noqa: UP045
     """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim, and for
     images, videos, runs and colour filters this package's own."""
     color: bool = False
@@ -178,9 +177,8 @@ class Simulate:
             pixel_thresholds=sensor.contrast_thresholds if self.sensor.threshold_spread else None,
             refractory_period=self.sensor.refractory_period,
             bayer_pattern=self.bayer_pattern,
-            frame_settings=self.frame,
-            seed=self.sensor.seed,
-            settings=self._settings(view, exposures),
+            response=Logarithm(self.sensor.log_eps).name,
+            settings={**self._settings(view, exposures), "frame_settings": asdict(self.frame)},
         )
         is_new = not output_dir.exists()
         try:
@@ -236,7 +234,7 @@ class Simulate:
         """Refuses flags that would change nothing."""
         poses_file = self.trajectory is not None and not self.trajectory.expanduser().is_dir()
         sizes = ("--width", "--height", "--field-of-view")
-        rig = PUBLISHED_RIGS.get(self.layout or "")
+        rig = writer_of(self.layout).published_rig if self.layout else None
         own_rig = rig is not None and self.cameras is None and self.from_run is None and self._pictures is None
         for applies, situation, useless in (
             (self._pictures, "for pictures, which have their size and no poses",
@@ -299,12 +297,14 @@ class Simulate:
             else:
                 motion = MOTIONS[self.motion or "shake"]
                 trajectory = motion(round(seconds * 1e9), scene.camera, scene.target, motion_rng)
-        if self.layout == "tum_vie":
+        assert self.layout is not None
+        poses_per_second = writer_of(self.layout).poses_per_second
+        if poses_per_second is not None:
             given = self.trajectory or self.key_frames
-            trajectory, original = sampled(trajectory, tum_vie.POSES_PER_SECOND), trajectory
+            trajectory, original = sampled(trajectory, poses_per_second), trajectory
             if given and trajectory is not original:
                 notes.append(
-                    f"{given} is followed through {tum_vie.POSES_PER_SECOND} poses a second, as many as TUM-VIE has."
+                    f"{given} is followed through {poses_per_second} poses a second, as many as {self.layout} has."
                 )
         event_camera, frame_camera, event_from_frame = self._read_cameras()
         for camera in (event_camera, frame_camera):
@@ -373,8 +373,10 @@ class Simulate:
         """Of events and of frames, and the pose of the latter in the axes of the former."""
         if self.cameras is not None:
             return read_cameras(self.cameras.expanduser())
-        if self.layout in PUBLISHED_RIGS:
-            return PUBLISHED_RIGS[self.layout]
+        assert self.layout is not None
+        rig = writer_of(self.layout).published_rig
+        if rig is not None:
+            return rig
         camera = self._pinhole()
         return camera, camera, np.eye(4)
 
@@ -383,8 +385,8 @@ class Simulate:
         preset = self._preset
         length = view.end - view.start
         rate = preset.num_frames / preset.duration if preset else FRAME_RATE
-        fewest = FEWEST_ESIM_FRAMES if self.layout == "esim" else 1
-        count = self.num_frames or max(fewest, round(rate * length * 1e-9))
+        assert self.layout is not None
+        count = self.num_frames or max(writer_of(self.layout).fewest_frames, round(rate * length * 1e-9))
         exposure_ms = self.exposure_ms
         if exposure_ms is None:
             longest = max(0, length // count // 2000 - 1) * 2e-3
@@ -425,16 +427,17 @@ class Simulate:
         self, view: View, exposures: Exposures, sensor: EventSensor, writer: Writer, preview: Preview | None
     ) -> None:
         def add_events(events: Events) -> None:
-            if self.layout == "eds":  # of which E-NeRF's loader wants a frame that is later than the last event
-                until = np.searchsorted(events.t, exposures.times[-1] - 1000)
-                events = Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until])
             writer.add_events(events)
             if preview is not None:
                 preview.add_events(events)
 
         def add_frame(frame: Frame, source: Source) -> None:
             depth = source.depth(frame.time) if isinstance(source, RenderedScene | TrainedRun) else None
-            sharp, blurred = writer.add_frame(frame, depth)
+            seed = self.sensor.seed
+            sharp = develop(frame.sharp, self.frame, frame.number, False, seed)
+            blurred = None if frame.blurred is None else develop(frame.blurred, self.frame, frame.number, True, seed)
+            linear = (frame.sharp, frame.blurred) if self.frame.hdr else None
+            writer.add_frame(frame.number, frame.time, sharp, blurred, depth, linear)
             if preview is not None:
                 preview.add_frame(sharp, blurred, depth)
 

@@ -159,8 +159,3 @@ def develop(
     if settings.read_noise:
         grey += rng.normal(0, settings.read_noise, grey.shape)
     return np.rint(grey).clip(0, 255).astype(np.uint8)
-
-
-def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
-    """An image with three channels, equal ones where it is grey."""
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)

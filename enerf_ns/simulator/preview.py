@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import in_colour
 from enerf_ns.dataparsers.recording import Events
-from enerf_ns.simulator.frames import in_colour
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
 """R G B of pixels whose latest event was off, that had none, and whose latest was on."""

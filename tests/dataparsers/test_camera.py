@@ -49,8 +49,54 @@ def test_pixel_directions_may_be_changed_by_the_caller():
 
 
 def test_a_distortion_without_inverse_is_refused():
-    with pytest.raises(ValueError, match=r"radtan distortion .* has no inverse at [\d,]+ of the 240 x 180 pixels"):
-        Camera(240, 180, 100.0, 100.0, 120.0, 90.0, (-0.6, 0.2, 0.0, 0.0), "radtan").pixel_directions()
+    with pytest.raises(
+        ValueError, match=r"radtan distortion .* fits no lens, since it has no inverse at [\d,]+ of 208 pixels tried"
+    ):
+        Camera(240, 180, 100.0, 100.0, 120.0, 90.0, (-0.6, 0.2, 0.0, 0.0), "radtan")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(width=0), "a camera of 0 x 180 pixels, but whole numbers from 1 to 65535"),
+        (dict(height=179.5), "a camera of 240 x 179.5 pixels, but whole"),
+        (dict(height=float("nan")), "a camera of 240 x nan pixels"),
+        (dict(width=2**16), "a camera of 65536 x 180 pixels"),
+        (dict(fx=0.0), "the focal lengths 0 and 335.353, but they must be above 0"),
+        (dict(fy=float("nan")), "the focal lengths 335.419 and nan"),
+        (dict(fx=1e9), "which fits no lens; state all in pixels"),
+        (dict(cx=float("inf")), "which fits no lens; state all in pixels"),
+        (dict(distortion=(0.1, 0.2, 0.3)), "of the model radtan, but finite numbers k1 k2 p1 p2 and perhaps k3"),
+        (dict(distortion=(0.1, 0.2, 0.3, float("nan"))), "of the model radtan, but finite numbers"),
+        (dict(model="fisheye"), "of the model fisheye, but finite numbers k1 k2 k3 k4"),
+        (dict(model="pinhole"), "of the model pinhole, but no coefficients"),
+        (dict(model="lookup", distortion=()), "without a table of where each pixel looks"),
+        (dict(model="lookup", distortion=(), directions=np.zeros((240, 180, 2))), r"of shape \(240, 180, 2\), but"),
+        (dict(model="lookup", distortion=(), directions=np.full((180, 240, 2), np.nan)), "but finite numbers"),
+        (
+            dict(model="lookup", distortion=(), directions=np.full((180, 240, 2), 1e5)),
+            "reach 100000, which fits",
+        ),
+    ],
+)
+def test_what_is_no_camera_is_refused_where_it_is_made(changes: dict, message: str):
+    with pytest.raises(ValueError, match=message) as error:
+        replace(RADTAN, **changes)
+    assert "\n" not in str(error.value)
+
+
+def test_a_whole_number_of_pixels_becomes_an_integer():
+    camera = replace(PINHOLE, width=12.0, height=np.float64(10))
+    assert (camera.width, camera.height) == (12, 10) and camera == PINHOLE
+    assert type(camera.width) is type(camera.height) is int
+
+
+def test_a_fold_between_the_pixels_that_are_tried_is_found_when_all_are_asked_for(monkeypatch: pytest.MonkeyPatch):
+    """With a step larger than the image, the corners alone are tried; of this lens, they see twice what others do."""
+    monkeypatch.setattr("enerf_ns.dataparsers.camera.CHECKED_STEP", 10**6)
+    camera = Camera(101, 101, 50.0, 50.0, 50.0, 50.0, (-1.0, 0.5, 0.0, 0.0), "radtan")
+    with pytest.raises(ValueError, match=r"has no inverse at [\d,]+ of 10,201 pixels"):
+        camera.pixel_directions()
 
 
 def test_undistorted_camera_of_a_fisheye_has_the_published_intrinsics():

@@ -7,24 +7,29 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import tyro
+import yaml
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from recordings import EVENTS, FRAME_TIMES, POSE_TIMES, poses, write_davis, write_esim
 from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation, Slerp
 
+from enerf_ns.dataparsers import event_dataparser
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.event_dataparser import (
-    DavisDataParserConfig,
-    EsimDataParserConfig,
     EventDataParserConfig,
     scene_normalisation,
 )
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.registry import formats, read_recording
+from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.event_dataset import EventDataset
+from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.poses.posed_camera import PosedCamera
 
 NEAR, FAR = 0.5, 4.0
@@ -235,16 +240,73 @@ def test_frames_are_undistorted_colour_pictures_with_depth_where_there_is(tmp_pa
     assert "depth" not in EventDataset(parse(davis))[0]
 
 
-@pytest.mark.parametrize(
-    ("config", "write"), [(EsimDataParserConfig, write_esim), (DavisDataParserConfig, write_davis)]
-)
-def test_a_named_format_reads_its_folders_and_no_others(tmp_path: Path, config, write):
+@pytest.mark.parametrize(("format", "write"), FORMATS.items())
+def test_a_named_format_reads_its_folders_and_no_others(tmp_path: Path, format: str, write):
     folder = write(tmp_path / "recording")
-    parser = config(data=folder, depth_range=(NEAR, FAR)).setup()
-    assert len(parser.get_dataparser_outputs("train").image_filenames) == 2
+    assert len(parse(folder, format=format).image_filenames) == 2
     other = (write_davis if write is write_esim else write_esim)(tmp_path / "other")
     with pytest.raises(SystemExit, match=str(other)):
-        config(data=other, depth_range=(NEAR, FAR)).setup().get_dataparser_outputs("train")
+        parse(other, format=format)
+
+
+@pytest.mark.parametrize("format", formats(), ids=lambda format: format.name)
+def test_each_format_has_a_sub_command(format: Format):
+    found = getattr(event_dataparser, format.command.replace("-", "_"))
+    assert isinstance(found, DataParserSpecification) and found.description == format.description
+    config = found.config
+    assert isinstance(config, EventDataParserConfig)
+    assert config == EventDataParserConfig(format=format.name, options=format.options())
+
+
+def test_a_sub_command_of_no_format_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'omni_events'"):
+        _ = event_dataparser.omni_events  # type: ignore[attr-defined]
+
+
+def test_flags_of_the_data_parser():
+    config = tyro.cli(EnerfDataManagerConfig, args=[]).dataparser
+    assert config == EventDataParserConfig()
+    config = tyro.cli(
+        EnerfDataManagerConfig, args=["tumvie-events", "--event-camera", "right", "--data", "x"]
+    ).dataparser
+    assert config == EventDataParserConfig(data=Path("x"), format="tum_vie", options=TumVieOptions("right"))
+    for wrong in (["eds-events", "--event-camera", "right"], ["tumvie-events", "--event-camera", "middle"]):
+        with pytest.raises(SystemExit):
+            tyro.cli(EnerfDataManagerConfig, args=wrong)
+
+
+def test_runs_of_before_there_were_options_can_be_loaded(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR))
+    del config.format, config.options
+    written = yaml.dump(config)
+    assert "format" not in written and "options" not in written
+    loaded = yaml.load(written, Loader=yaml.Loader)
+    assert len(loaded.setup().get_dataparser_outputs("train").image_filenames) == 2
+
+
+def test_options_are_written_with_a_run(tmp_path: Path):
+    config = EventDataParserConfig(data=tmp_path, format="tum_vie", options=TumVieOptions("right"))
+    assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
+    assert yaml.load(yaml.dump(EventDataParserConfig()), Loader=yaml.Loader) == EventDataParserConfig()
+
+
+def test_a_frame_that_vanished_is_an_error_and_no_picture_of_events(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    recording = read_recording(folder)
+    assert recording.frames is not None
+    recording.frames.filenames[0].unlink()
+    outputs = parse(folder)
+    assert outputs.metadata["are_frames"] is True
+    with pytest.raises(RecordingError, match=r"00000\.png is missing; an image was expected there"):
+        EventDataset(outputs)[0]
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_a_recording_without_frames_is_known_as_one(tmp_path: Path, split: str):
+    outputs = parse(write_esim(tmp_path / "esim", frames=()), split)
+    assert outputs.metadata["are_frames"] is False
+    assert EventDataset(outputs)[0]["image"].shape == (18, 24, 3)
 
 
 def test_depth_that_cannot_be_measured_is_an_error_of_one_sentence_that_names_the_flag(tmp_path: Path):

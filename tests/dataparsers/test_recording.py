@@ -5,13 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from recordings import HEIGHT, WIDTH, write_davis, write_esim
+from recordings import HEIGHT, WIDTH
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_image
-from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -77,41 +74,32 @@ def test_nothing_is_noted_when_nothing_is_dropped():
     assert len(index_events(whole).events()) == 2 and whole.notes == index_events(whole).notes == ()
 
 
-def test_read_recording_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    davis, esim = write_davis(tmp_path / "davis"), write_esim(tmp_path / "esim")
-    assert read_recording(davis).format == "davis"
-    assert read_recording(esim).format == "esim"
-    monkeypatch.chdir(tmp_path)
-    assert read_recording("esim") is read_recording(esim)
-
-
 @pytest.mark.parametrize(
-    ("mode", "channels"), [("L", 1), ("RGB", 3), ("RGBA", 3), ("LA", 1), ("P", 3), ("I;16", 1), ("1", 1)]
+    ("stated", "message"),
+    [
+        (dict(contrast_thresholds=(0.2, 0.0)), r"contrast thresholds 0\.2 \(of on events\) and 0"),
+        (dict(contrast_thresholds=(float("nan"), 0.2)), "both must be above 0"),
+        (dict(refractory_period=-1), "refractory period -1 ns"),
+        (dict(refractory_period=10**13), "refractory period 1e.13 ns"),
+        (dict(bayer_pattern="RGB"), "Bayer pattern 'RGB'"),
+        (dict(bayer_pattern="RGBX"), "Bayer pattern 'RGBX'"),
+        (dict(response="log"), "response 'log'"),
+        (dict(response="logarithm:"), "response 'logarithm:'"),
+        (dict(response="logarithm:0"), "response 'logarithm:0'"),
+        (dict(depth_range=(2.0, 1.0)), "range of depth 2 m to 1 m"),
+        (dict(depth_range=(0.0, 1.0)), "range of depth 0 m to 1 m"),
+    ],
 )
-def test_load_image_gives_one_or_three_channels_of_uint8(tmp_path: Path, mode: str, channels: int):
-    grey = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 256
-    if mode == "I;16":
-        image = Image.fromarray((grey * 257).astype(np.uint16))
-    elif mode == "1":
-        grey = np.where(grey > 127, 255, 0)
-        image = Image.fromarray(grey.astype(np.uint8)).convert("1")
-    else:
-        image = Image.fromarray(grey.astype(np.uint8)).convert("RGB").convert(mode)
-    image.save(tmp_path / "image.png")
-    loaded = load_image(tmp_path / "image.png")
-    assert loaded.dtype == np.uint8 and loaded.shape == (HEIGHT, WIDTH, channels)
-    tolerance = 51 if mode == "P" else 0  # a palette of 216 colours is coarse
-    np.testing.assert_allclose(loaded.astype(int), np.repeat(grey[..., None], channels, 2), atol=tolerance)
+def test_what_a_recording_states_is_checked_where_it_is_made(stated: dict, message: str):
+    whole = recording(np.array([[1, 2, 0, 1], [1, 2, 100, 1]]))
+    with pytest.raises(ValueError, match=message) as error:
+        replace(whole, **stated)
+    assert not isinstance(error.value, RecordingError) and "\n" not in str(error.value)
 
 
-def test_what_is_transparent_is_laid_over_white(tmp_path: Path):
-    pixels = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "image.png")
-    color, alpha = pixels[..., :3].astype(float), pixels[..., 3:] / 255
-    found = load_image(tmp_path / "image.png")
-    np.testing.assert_allclose(found, alpha * color + (1 - alpha) * 255, atol=1)
-    opaque = pixels[..., 3] == 255
-    np.testing.assert_array_equal(found[opaque], pixels[opaque, :3])
+@pytest.mark.parametrize("response", ["linlog", "logarithm:0.001", "logarithm:1e-05", None])
+def test_responses(response: str | None):
+    assert replace(recording(np.array([[1, 2, 0, 1]])), response=response).response == response
 
 
 def test_a_recording_error_is_a_value_error():

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from recordings import write_esim
 
-from enerf_ns.dataparsers.errors import OutputError, RecordingError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.scripts.format_options import format_flags
 from enerf_ns.scripts.inspect import Inspect
 
 
@@ -70,6 +71,7 @@ def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
     with pytest.raises(RecordingError, match="does not exist"):
         Inspect(tmp_path / "nowhere", tmp_path / "page.html").main()
     folder = write_esim(tmp_path / "esim")
-    with pytest.raises(RecordingError):
-        Inspect(folder, tmp_path / "page.html", event_camera="right").main()
+    right = format_flags()(event_camera="right")  # type: ignore[call-arg] - a field made from the options of TUM-VIE
+    with pytest.raises(FlagError, match=r"--event-camera is for recordings of tum_vie, but .* is read as esim"):
+        Inspect(folder, tmp_path / "page.html", right).main()
     assert not (tmp_path / "page.html").exists()

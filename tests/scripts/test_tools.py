@@ -164,7 +164,7 @@ def test_every_format_trains_as_it_is_unpacked(call, name: str, capsys: pytest.C
     (config,) = Path("outputs").glob("*/enerf/*/config.yml")
     assert list((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
     parser = yaml.load(config.read_text(), Loader=yaml.Loader).pipeline.datamanager.dataparser
-    assert getattr(parser, "event_camera", "left") == (flags[-1] if flags else "left")
+    assert getattr(parser.options, "event_camera", "left") == (flags[-1] if flags else "left")
     assert (
         f"({format.removesuffix('-events').replace('tumvie', 'tum_vie').replace('-', '_')})" in capsys.readouterr().out
     )

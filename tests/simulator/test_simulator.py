@@ -16,10 +16,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.formats.registry import read_recording, writer_of
+from enerf_ns.dataparsers.formats.writer import Rig
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.scripts.simulate import PUBLISHED_RIGS, Simulate
+from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -27,6 +28,12 @@ from enerf_ns.simulator.trajectories import MOTIONS, look_at, sampled
 
 WIDTH, HEIGHT = 48, 36
 SHORT: dict[str, Any] = dict(duration=0.3, num_frames=12, width=WIDTH, height=HEIGHT)
+
+
+def published_rig(layout: str) -> Rig:
+    rig = writer_of(layout).published_rig
+    assert rig is not None
+    return rig
 
 
 def camera_of(width: int, height: int, focal_length: float) -> Camera:
@@ -200,7 +207,7 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
     ],
 )
 def test_settings_that_make_no_recording_are_refused(tmp_path, wrong, sentence):
-    with pytest.raises(RecordingError, match=sentence):
+    with pytest.raises(UserError, match=sentence):
         Simulate(**{"scene": "shapes", "output_dir": tmp_path / "new", **SHORT, **wrong}).main()
     assert not list(tmp_path.iterdir())
 
@@ -257,7 +264,7 @@ def test_a_video_of_pictures_makes_events(tmp_path):
 
 def test_the_published_cameras_of_tum_vie_are_those_of_its_calibration(shared_data):
     stated = json.loads((shared_data / "tum_vie/camera-calibrationA.json").read_text())["value0"]
-    event_camera, frame_camera, event_from_frame = PUBLISHED_RIGS["tum_vie"]
+    event_camera, frame_camera, event_from_frame = published_rig("tum_vie")
     poses = []
     for index, camera in ((2, event_camera), (0, frame_camera)):
         lens = stated["intrinsics"][index]["intrinsics"]
@@ -288,7 +295,7 @@ def test_layouts_of_data_sets_have_their_cameras_and_the_trajectory_that_was_ren
         max_displacement=32.0, max_change=9.0,
     ).main()  # fmt: skip
     read = read_recording(tmp_path / "new")
-    event_camera, frame_camera, event_from_frame = PUBLISHED_RIGS[layout]
+    event_camera, frame_camera, event_from_frame = published_rig(layout)
     assert read.frames is not None and (read.camera, read.frames.camera) == (event_camera, frame_camera)
     np.testing.assert_array_equal(read.frames.times, [5_000_000, 15_000_000])
     scene_rng, motion_rng = np.random.default_rng(0).spawn(2)

@@ -59,8 +59,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 
 from enerf_ns.dataparsers.errors import RecordingError, UserError
-from enerf_ns.dataparsers.files import load_image
-from enerf_ns.dataparsers.formats.event_recording import read_json
+from enerf_ns.dataparsers.files import load_image, read_json
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.scenes import (
     LIGHT,

@@ -285,7 +285,7 @@ ESIM = [
         "poses_bounds of LLFF without bounds", save("poses_bounds.npy", np.zeros((9, 15))), ("(9, 15)", "(N, 17)")
     ),
     BadInput(
-        "sensor without size", edit_array("poses_bounds.npy", (0, 4), 0), ("poses_bounds.npy", "height 0", "above 0")
+        "sensor without size", edit_array("poses_bounds.npy", (0, 4), 0), ("poses_bounds.npy", "24 x 0 pixels", "whole")
     ),
     BadInput(
         "focal length NaN", edit_array("poses_bounds.npy", (0, 14), np.nan), ("poses_bounds.npy", "nan", "above 0")
@@ -315,7 +315,7 @@ ESIM = [
     BadInput(
         "threshold zero",
         write("simulation.json", json.dumps({"contrast_thresholds": [0.2, 0]})),
-        ("simulation.json holds contrast_thresholds = [0.2, 0]", "above 0"),
+        ("simulation.json holds the contrast thresholds 0.2", "and 0 (", "above 0"),
     ),
     BadInput(
         "camera without focal length",

@@ -319,11 +319,11 @@ BAD_INPUT = {
     ),
     "threshold negative": (
         write("esim.conf", "--contrast_threshold_neg=-0.2"),
-        "esim.conf holds the contrast thresholds 1 (positive) and -0.2 (negative), but both must be above 0",
+        "esim.conf holds the contrast thresholds 1 (of on events) and -0.2 (of off events), but both must be above 0",
     ),
     "refractory period negative": (
         write("esim.conf", "--refractory_period_ns=-5"),
-        "esim.conf holds the refractory period -5 ns, but it must not be below 0",
+        "esim.conf holds the refractory period -5 ns, but from 0",
     ),
     "colour maybe": (
         write("esim.conf", "--simulate_color_events=maybe"),

@@ -356,12 +356,15 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     "key misspelt": (camera(distorsion=[1]), "recording.json holds the unknown key 'distorsion' in camera"),
     "other key misspelt": ({"contrast_threshold": 1}, "holds the unknown key 'contrast_threshold'; known are camera,"),
     "camera is no object": ({"camera": [1, 2]}, "recording.json holds camera = [1, 2], but an object with width,"),
-    "width is no whole number": (camera(width=24.5), "holds camera.width = 24.5, but a whole number from 1 to 65535"),
-    "width is true": (camera(width=True), "holds camera.width = true"),
-    "height 0": (camera(height=0), "holds camera.height = 0"),
+    "width is no whole number": (
+        camera(width=24.5),
+        "camera, holds a camera of 24.5 x 18 pixels, but whole numbers from 1 to 65535",
+    ),
+    "width is true": (camera(width=True), "holds camera (width, height, fx, fy, cx, cy) = [true, 18, "),
+    "height 0": (camera(height=0), "camera, holds a camera of 24 x 0 pixels"),
     "focal length negative": (camera(fx=-1), "holds the focal lengths -1 and 21, but they must be above 0"),
-    "focal length NaN": (camera(fy=float("nan")), "holds camera = [20.0, NaN, 11.5, 8.5], but numbers fx, fy, cx, cy"),
-    "principal point a text": (camera(cx="11.5"), 'holds camera = [20.0, 21.0, "11.5", 8.5], but numbers'),
+    "focal length NaN": (camera(fy=float("nan")), "= [24, 18, 20.0, NaN, 11.5, 8.5], but numbers of pixels"),
+    "principal point a text": (camera(cx="11.5"), '= [24, 18, 20.0, 21.0, "11.5", 8.5], but numbers of pixels'),
     "model unknown": (
         camera(model="ftheta"),
         'camera.model = "ftheta", but one of pinhole, radtan, fisheye and lookup',
@@ -369,16 +372,25 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     "model is a list": (camera(model=["pinhole"]), 'camera.model = ["pinhole"], but one of'),
     "pinhole with distortion": (
         camera(distortion=[0.1]),
-        "camera.distortion = [0.1], but 0 numbers, as the model pinhole",
+        "the distortion (0.1,) of the model pinhole, but no coefficients",
     ),
-    "radtan with three": (camera(model="radtan", distortion=[0, 0, 0]), "but 4 or 5 numbers, as the model radtan has"),
-    "radtan with none": (camera(model="radtan"), "camera.distortion = [], but 4 or 5 numbers"),
+    "radtan with three": (
+        camera(model="radtan", distortion=[0, 0, 0]),
+        "of the model radtan, but finite numbers k1 k2 p1 p2 and",
+    ),
+    "radtan with none": (camera(model="radtan"), "the distortion () of the model radtan, but finite numbers k1 k2 p1"),
     "distortion of texts": (
         camera(model="radtan", distortion=list("0000")),
-        'distortion = ["0", "0", "0", "0"], but 4',
+        'distortion = ["0", "0", "0", "0"], but numbers',
     ),
-    "distortion nested": (camera(model="radtan", distortion=[[0], 0, 0, 0]), "distortion = [[0], 0, 0, 0], but 4 or 5"),
-    "no such lens": (camera(model="radtan", fx=5, fy=5, distortion=[-0.9, 0, 0, 0]), "a camera that fits no lens"),
+    "distortion nested": (
+        camera(model="radtan", distortion=[[0], 0, 0, 0]),
+        "distortion = [[0], 0, 0, 0], but numbers",
+    ),
+    "no such lens": (
+        camera(model="radtan", fx=5, fy=5, distortion=[-0.9, 0, 0, 0]),
+        "camera, holds the radtan distortion",
+    ),
     "no table": (camera(model="lookup"), "camera_directions.npy is missing"),
     "frame camera lookup": (
         frame_camera(model="lookup"),
@@ -400,12 +412,16 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
         "last row is [1.0, 0.0, 0.0, 1.0], but 0 0 0 1 was expected",
     ),
     "one threshold": ({"contrast_thresholds": 0.2}, "contrast_thresholds = 0.2, but two numbers above 0"),
-    "threshold 0": ({"contrast_thresholds": [0.2, 0]}, "contrast_thresholds = [0.2, 0], but two numbers above 0"),
-    "far before near": ({"depth_range": [4, 1]}, "depth_range = [4, 1], but the nearest and the farthest"),
-    "period a fraction": ({"refractory_period_ns": 0.5}, "refractory_period_ns = 0.5, but a whole number from 0"),
-    "three colours": ({"bayer_pattern": "RGB"}, 'bayer_pattern = "RGB", but the colours of the pixels'),
-    "colour unknown": ({"bayer_pattern": "RGGX"}, 'bayer_pattern = "RGGX", but the colours'),
-    "no colour": ({"bayer_pattern": 4}, "bayer_pattern = 4, but the colours"),
+    "threshold 0": ({"contrast_thresholds": [0.2, 0]}, "the contrast thresholds 0.2 (of on events) and 0 ("),
+    "far before near": ({"depth_range": [4, 1]}, "the range of depth 4 m to 1 m, but the nearest and"),
+    "period a fraction": ({"refractory_period_ns": 0.5}, "refractory_period_ns = 0.5, but a whole number"),
+    "three colours": ({"bayer_pattern": "RGB"}, "the Bayer pattern 'RGB', but four letters of R, G and B, the"),
+    "colour unknown": ({"bayer_pattern": "RGGX"}, "the Bayer pattern 'RGGX', but four"),
+    "period negative": ({"refractory_period_ns": -1}, "the refractory period -1 ns, but from 0"),
+    "response unknown": ({"response": "log"}, "the response 'log', but linlog, or logarithm:OFFSET with an"),
+    "offset negative": ({"response": "logarithm:-1"}, "the response 'logarithm:-1', but"),
+    "response no text": ({"response": 0.001}, "the response 0.001, but"),
+    "no colour": ({"bayer_pattern": 4}, "the Bayer pattern 4, but four"),
 }
 
 
@@ -453,7 +469,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
         save("events/y.npy", EVENTS[:4, 1]),
         "different lengths (6 in x.npy, 4 in y.npy, 6 in t.npy, 6 in p.npy)",
     ),
-    "recording.json missing": (remove("recording.json"), "recording.json is missing; a JSON file was expected"),
+    "recording.json missing": (remove("recording.json"), "recording.json is missing; JSON was expected"),
     "recording.json cut off": (cut("recording.json", 3), "recording.json cannot be read as JSON"),
     "recording.json a list": (
         put("recording.json", "[]"),
@@ -485,7 +501,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
             (folder / "recording.json").write_text(json.dumps(camera(model="lookup"))),
             np.save(folder / "camera_directions.npy", np.zeros((WIDTH, HEIGHT, 2))),
         ),
-        "camera_directions.npy holds an array of shape (24, 18, 2), but finite numbers of shape (height, width, 2)",
+        "looks of shape (24, 18, 2), but finite numbers of shape (height, width, 2)",
     ),
 }
 

@@ -889,8 +889,12 @@ FOUND: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "x that wraps": ("esim", save_rows(2**32 + 3), "event 6 holds x = 4.29497e+09, where a whole number"),
     "stamps in µs": ("esim", scale_stamps("images/image_stamps_ns.txt", 1e-3), "frames within 0.0006 s and poses"),
     "stamps in ps": ("esim", scale_stamps("images_corrupted/image_stamps_ns.txt", 1e3), "blurred frames within 600 s"),
-    "truth for a number": ("esim", change("simulation.json", "camera", "cx", value=True), "camera = {"),
-    "lines in a value": ("esim", change("simulation.json", "camera", value="two\nlines"), "camera = 'two\\nlines'"),
+    "truth for a number": (
+        "esim",
+        change("simulation.json", "camera", "cx", value=True),
+        "camera (width, height, fx, fy, cx, cy) = [24",
+    ),
+    "lines in a value": ("esim", change("simulation.json", "camera", value="two\nlines"), 'camera = "two\\nlines"'),
     "huge number": ("esim", change("simulation.json", "depth_range", 1, value=10**400), "holds depth_range = [0.5, 1"),
     "focal lengths in mm": (
         "esim",

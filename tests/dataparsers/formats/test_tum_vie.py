@@ -611,7 +611,7 @@ BAD_RAW = {
     ),
     "broken JSON": (write(CAMERAS, '{"value0": {'), CAMERAS, "JSON"),
     "JSON nested too deeply": (write(CAMERAS, "[" * 100_000), CAMERAS, "JSON"),
-    "JSON of something else": (write(MARKER, "[1, 2]"), MARKER, "value0"),
+    "JSON of something else": (write(MARKER, "[1, 2]"), MARKER, "holds a list"),
     "bytes that are no text": (lambda folder: (folder / CAMERAS).write_bytes(b"\xff\xfe\x00\x81"), CAMERAS, "JSON"),
     "too few cameras": (
         edit_json(CAMERAS, lambda value: value.update(intrinsics=value["intrinsics"][:2])),

@@ -1,4 +1,4 @@
-"""What the simulator writes, read back by the readers, and by a loop that does what E-NeRF's reference code does."""
+"""What writers write, read back by the readers, and by a loop that does what E-NeRF's reference code does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import h5py
@@ -24,17 +24,16 @@ from recordings import joined
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.files import load_image
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.registry import layouts, open_writer, read_recording
+from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator import writers
-from enerf_ns.simulator.frames import Frame, FrameSettings, develop
-from enerf_ns.simulator.writers import LAYOUTS, Setup, Writer, open_writer
 
+LAYOUTS = layouts()
 END = 333_333_347
 """ns; no whole microsecond."""
 
@@ -85,6 +84,7 @@ def setup_of(layout: str, **changes: Any) -> Setup:
         frame_times=FRAME_TIMES,
         exposure=EXPOSURE,
         contrast_thresholds=THRESHOLDS,
+        response="logarithm:0.001",
         settings={"scene": "carpet", "seed": 3},
     )
     return replace(setup, **changes)
@@ -102,15 +102,42 @@ def part(events: Events, start: int, stop: int) -> Events:
     return Events(*(getattr(events, name)[start:stop] for name in "xytp"))
 
 
-def frame_of(setup: Setup, number: int, channels: tuple[int, ...] = ()) -> tuple[Frame, np.ndarray]:
+class Frame(NamedTuple):
+    number: int
+    time: int
+    sharp: np.ndarray
+    """uint8, as is the blurred frame."""
+    blurred: np.ndarray | None
+    depth: np.ndarray
+
+
+def levels(brightness: np.ndarray) -> np.ndarray:
+    return np.rint(255 * brightness).clip(0, 255).astype(np.uint8)
+
+
+def kept(layout: str, events: Events) -> Events:
+    """Those that are written: of EDS, in which the last frame must be later than the last event, not all."""
+    return part(events, 0, int((events.t < FRAME_TIMES[-1] - 1000).sum())) if layout == "eds" else events
+
+
+def frame_of(setup: Setup, number: int, channels: tuple[int, ...] = ()) -> Frame:
     """A frame of smooth pictures, and its depth; the first pixel of depth has none."""
+    (sharp, blurred), depth = linear_of(setup, number, channels)
+    exposed = None if blurred is None else levels(blurred)
+    return Frame(number, int(setup.frame_times[number]), levels(sharp), exposed, depth)
+
+
+def linear_of(
+    setup: Setup, number: int, channels: tuple[int, ...] = ()
+) -> tuple[tuple[np.ndarray, np.ndarray | None], np.ndarray]:
+    """Linear brightness of a frame, sharp and blurred, and its depth."""
     camera, rng = setup.frame_camera, np.random.default_rng(number)
     shape = (camera.height, camera.width, *channels)
     sharp = cv2.GaussianBlur(rng.uniform(0, 1.1, shape), (0, 0), 2).reshape(shape)
     depth = rng.uniform(1 + 0.1 * number, 2 + 0.1 * number, shape[:2]).astype(np.float32)
     depth[0, 0] = 0
     blurred = cv2.GaussianBlur(sharp, (0, 0), 3).reshape(shape) if setup.exposure else None
-    return Frame(number, int(setup.frame_times[number]), sharp, blurred), depth
+    return (sharp, blurred), depth
 
 
 def write(
@@ -169,9 +196,9 @@ def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         setup = replace(setup, refractory_period=1500, bayer_pattern="RGGB")
     events = random_events(setup.event_camera)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writers, "EVENTS_AT_A_TIME", 1000)
+        patch.setattr(Writer, "events_held", 1000)
         write(layout, folder, setup, events)
-    yield Written(layout, folder, setup, events, read_recording(folder))
+    yield Written(layout, folder, setup, kept(layout, events), read_recording(folder))
 
 
 def test_the_layout_is_recognised_and_its_reader_notes_nothing_lost(written: Written):
@@ -224,24 +251,29 @@ def test_frames_and_depth_are_read_back(written: Written):
         assert len(frames.filenames) == len(FRAME_TIMES)
     sharp_files = sharp.filenames if sharp else tuple(sorted((written.folder / "sharp_images").iterdir()))
     for number in range(len(FRAME_TIMES)):
-        frame, depth = frame_of(written.setup, number)
+        frame = frame_of(written.setup, number)
         assert frame.blurred is not None
-        for file, brightness in ((sharp_files[number], frame.sharp), (blurred.filenames[number], frame.blurred)):
-            levels = np.rint(255 * brightness).clip(0, 255)[..., None]
+        for file, pixels in ((sharp_files[number], frame.sharp), (blurred.filenames[number], frame.blurred)):
             image = load_image(file)
             assert image.shape[2] == (3 if written.layout in ("esim", "eds") else 1)
-            np.testing.assert_array_equal(image, np.broadcast_to(levels, image.shape))
-        np.testing.assert_array_equal(np.load(written.folder / f"depth/{number:05d}.npy"), depth)
+            np.testing.assert_array_equal(image, np.broadcast_to(pixels[..., None], image.shape))
+        np.testing.assert_array_equal(np.load(written.folder / f"depth/{number:05d}.npy"), frame.depth)
     if sharp:
         assert sharp.depth_filenames is not None and len(sharp.depth_filenames) == len(FRAME_TIMES)
 
 
 def test_the_truth_lies_beside_it(written: Written):
     truth = json.loads((written.folder / "simulation.json").read_text())
-    depths = np.stack([frame_of(written.setup, number)[1] for number in range(12)])
+    depths = np.stack([frame_of(written.setup, number).depth for number in range(12)])
     nearest, farthest = float(depths[depths > 0].min()), float(depths.max())
     expected = {"scene": "carpet", "seed": 3, "contrast_thresholds": list(THRESHOLDS), "exposure_ns": EXPOSURE}
-    expected |= {"num_events": 5000, "num_frames": 12, "finished": True, "layout": written.layout}
+    expected |= {
+        "num_events": len(written.events),
+        "num_frames": 12,
+        "response": "logarithm:0.001",
+        "finished": True,
+        "layout": written.layout,
+    }
     expected |= {"clock_start_ns": CLOCK_START[written.layout], "depth_range": [nearest, farthest]}
     assert {key: truth[key] for key in expected} == expected
     assert truth["camera"]["fx"] == written.setup.event_camera.fx
@@ -262,7 +294,7 @@ def test_nothing_but_what_belongs_there_is_left(written: Written):
 def test_how_events_are_handed_over_does_not_matter(tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch):
     setup = setup_of(layout)
     events = random_events(setup.event_camera, 600)
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 100)
+    monkeypatch.setattr(Writer, "events_held", 100)
     read = []
     for name, step in (("one", 1), ("some", 37), ("all", 600)):
         write(layout, tmp_path / name, setup, events, step=step)
@@ -279,39 +311,30 @@ def test_frames_in_colour(tmp_path: Path, layout: str):
     recording = read_recording(tmp_path / "recording")
     assert recording.frames is not None and recording.blurred_frames is None
     for number, file in enumerate(recording.frames.filenames):
-        frame, _ = frame_of(setup, number, (3,))
-        np.testing.assert_array_equal(load_image(file), np.rint(255 * frame.sharp).clip(0, 255))
+        np.testing.assert_array_equal(load_image(file), frame_of(setup, number, (3,)).sharp)
     assert np.abs(recording.frames.times - FRAME_TIMES).max() <= (500 if layout in IN_MICROSECONDS else 0)
     assert not (tmp_path / "recording/sharp_images").exists()
-
-
-def test_frames_are_those_that_the_sensor_reads_out(tmp_path: Path):
-    settings = FrameSettings(saturation=0.7, read_noise=3.0, shot_noise=900.0)
-    setup = setup_of("event_recording", frame_settings=settings, seed=5)
-    (tmp_path / "new").mkdir()
-    with open_writer("event_recording", tmp_path / "new", setup) as writer:
-        frame, depth = frame_of(setup, 0)
-        sharp, blurred = writer.add_frame(frame, depth)
-        writer.add_events(random_events(RGB))
-    assert frame.blurred is not None and blurred is not None
-    np.testing.assert_array_equal(sharp, develop(frame.sharp, settings, 0, False, seed=5))
-    np.testing.assert_array_equal(blurred, develop(frame.blurred, settings, 0, True, seed=5))
-    recording = read_recording(tmp_path / "new")
-    assert recording.frames is not None and recording.blurred_frames is not None
-    np.testing.assert_array_equal(load_image(recording.frames.filenames[0])[..., 0], sharp)
-    np.testing.assert_array_equal(load_image(recording.blurred_frames.filenames[0])[..., 0], blurred)
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_high_dynamic_range(tmp_path: Path, channels: tuple[int, ...], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OPENCV_IO_ENABLE_OPENEXR", raising=False)
-    setup = setup_of("esim", frame_settings=FrameSettings(saturation=0.2, read_noise=9.0, hdr=True))
-    writer = write("esim", tmp_path / "npy", setup, random_events(CENTRED), channels)
-    assert len(writer.notes) == 1 and "written as .npy alone" in writer.notes[0]
+    setup = setup_of("esim")
+
+    def written(name: str) -> list[str]:
+        (tmp_path / name).mkdir()
+        with open_writer("esim", tmp_path / name, setup) as writer:
+            for number in range(len(FRAME_TIMES)):
+                linear, _ = linear_of(setup, number, channels)
+                writer.add_frame(*frame_of(setup, number, channels), linear=linear)
+        return writer.notes
+
+    notes = written("npy")
+    assert len(notes) == 1 and "written as .npy alone" in notes[0]
     assert not list(tmp_path.rglob("*.exr"))
-    frame, _ = frame_of(setup, 7, channels)
-    assert frame.blurred is not None
-    for folder, brightness in (("hdr", frame.sharp), ("hdr_blurred", frame.blurred)):
+    (sharp, blurred), _ = linear_of(setup, 7, channels)
+    assert blurred is not None
+    for folder, brightness in (("hdr", sharp), ("hdr_blurred", blurred)):
         assert len(list((tmp_path / "npy" / folder).iterdir())) == 12
         array = np.load(tmp_path / "npy" / folder / "00007.npy")
         assert array.dtype == np.float32
@@ -322,10 +345,10 @@ def test_high_dynamic_range(tmp_path: Path, channels: tuple[int, ...], monkeypat
         cv2.haveImageWriter(".exr")
     except cv2.error:
         pytest.skip("this OpenCV writes no .exr")
-    assert list(write("esim", tmp_path / "exr", setup, random_events(CENTRED), channels).notes) == []
+    assert written("exr") == []
     found = cv2.imread(str(tmp_path / "exr/hdr/00007.exr"), cv2.IMREAD_UNCHANGED)
     assert found is not None
-    np.testing.assert_array_equal(found[..., ::-1] if channels else found, frame.sharp.astype(np.float32))
+    np.testing.assert_array_equal(found[..., ::-1] if channels else found, sharp.astype(np.float32))
 
 
 def test_thresholds_of_pixels(tmp_path: Path):
@@ -344,7 +367,7 @@ def test_without_poses_and_depth(tmp_path: Path):
     folder.mkdir()
     with open_writer("event_recording", folder, setup) as writer:
         writer.add_events(random_events(RGB))
-        writer.add_frame(frame_of(setup, 0)[0], None)
+        writer.add_frame(*frame_of(setup, 0)[:-1])
     assert not (folder / "depth").exists() and writer.depth_range is None
     with pytest.raises(RecordingError, match=r"poses\.txt is missing"):
         read_recording(folder, "event_recording")
@@ -419,17 +442,19 @@ def test_bounds_are_those_of_the_depth_and_poses_those_of_the_frames(tmp_path: P
 
 
 def test_hdf5_files_are_those_of_the_data_sets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 700)
+    monkeypatch.setattr(Writer, "events_held", 700)
     for layout, name, group, filters in (
         ("eds", "events.h5", "", []),
         ("tum_vie", "simulated-events_left.h5", "events/", [32001]),
     ):
         setup = setup_of(layout)
-        write(layout, tmp_path / layout, setup, random_events(setup.event_camera))
+        events = random_events(setup.event_camera)
+        write(layout, tmp_path / layout, setup, events)
+        count = len(kept(layout, events))
         with h5py.File(tmp_path / layout / name) as file:
             for column, dtype in zip("xytp", ("u2", "u2", "i8", "u1"), strict=True):
                 dataset = file[group + column]
-                assert isinstance(dataset, h5py.Dataset) and dataset.dtype == dtype and len(dataset) == 5000
+                assert isinstance(dataset, h5py.Dataset) and dataset.dtype == dtype and len(dataset) == count
                 properties = dataset.id.get_create_plist()
                 assert [properties.get_filter(i)[0] for i in range(properties.get_nfilters())] == filters
             times = np.asarray(file[group + "t"])
@@ -458,11 +483,11 @@ def check_what_is_left(layout: str, folder: Path, setup: Setup, events: Events, 
     if recording.frames is not None:
         num_frames = len(recording.frames.filenames)
         for number, file in enumerate(recording.frames.filenames):
-            frame, depth = frame_of(setup, number)
+            frame = frame_of(setup, number)
             shown = frame.blurred if layout in IN_MICROSECONDS else frame.sharp
             assert shown is not None
-            np.testing.assert_array_equal(load_image(file)[..., 0], np.rint(255 * shown).clip(0, 255))
-            np.testing.assert_array_equal(np.load(folder / f"depth/{number:05d}.npy"), depth)
+            np.testing.assert_array_equal(load_image(file)[..., 0], shown)
+            np.testing.assert_array_equal(np.load(folder / f"depth/{number:05d}.npy"), frame.depth)
     assert not list(folder.rglob("*.partial"))
     return len(found), num_frames
 
@@ -485,7 +510,7 @@ def test_an_interrupted_recording_holds_all_that_was_added(tmp_path: Path, layou
 
 
 def write_and_wait(layout: str, folder: Path, written: Connection) -> None:
-    writers.EVENTS_AT_A_TIME = 500
+    Writer.events_held = 500
     setup = setup_of(layout)
     events = random_events(setup.event_camera)
     writer = open_writer(layout, folder, setup)
@@ -513,7 +538,7 @@ def test_a_killed_process_leaves_what_it_wrote(tmp_path: Path, layout: str):
 
 @pytest.mark.parametrize("layout", ["eds", "tum_vie"])
 def test_an_interruption_between_two_columns(tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 500)
+    monkeypatch.setattr(Writer, "events_held", 500)
     setup, folder = setup_of(layout), tmp_path / "new"
     events = random_events(setup.event_camera)
     folder.mkdir()
@@ -534,7 +559,7 @@ def test_an_interruption_between_two_columns(tmp_path: Path, layout: str, monkey
 
 def write_until_it_fails(layout: str, folder: Path, setup: Setup, events: Events, with_frames: bool) -> str:
     """The message of the error."""
-    with pytest.raises(RecordingError) as caught:
+    with pytest.raises(OutputError) as caught:
         write(layout, folder, setup, events, with_frames=with_frames)
     return str(caught.value)
 
@@ -566,7 +591,7 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
 def test_what_was_written_before_the_disk_was_full_can_be_read(
     layout: str, with_frames: bool, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 1000)
+    monkeypatch.setattr(Writer, "events_held", 1000)
     setup = setup_of(layout)
     camera = setup.frame_camera
     large = Camera(200, 150, 175.0, 175.0, 100.0, 75.0, camera.distortion, camera.model)
@@ -586,7 +611,7 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(
 def test_a_file_that_may_not_grow_any_more(tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch):
     """As a full disk, for users who cannot mount one."""
     resource = pytest.importorskip("resource")
-    monkeypatch.setattr(writers, "EVENTS_AT_A_TIME", 1000)
+    monkeypatch.setattr(Writer, "events_held", 1000)
     setup, folder = setup_of(layout), tmp_path / "new"
     events = random_events(setup.event_camera, 60_000)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -608,7 +633,7 @@ def test_memory_does_not_grow_with_the_events(tmp_path: Path, layout: str):
     with open_writer(layout, folder, setup) as writer:
         tracemalloc.start()
         for start in range(0, 100 * count, count):
-            times = 3_000_000 + 160 * np.arange(start, start + count)
+            times = 3_000_000 + 140 * np.arange(start, start + count)
             writer.add_events(Events(np.arange(count) % 30, np.arange(count) % 20, times, np.ones(count, np.int8)))
             peaks.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
@@ -636,12 +661,16 @@ def test_memory_does_not_grow_with_the_events(tmp_path: Path, layout: str):
         ("eds", dict(frame_camera=replace(RGB, distortion=(0.1, 0, 0, 0, 0))), "but one of 5 of radtan was asked for"),
         ("tum_vie", dict(event_camera=RADTAN), "tum_vie holds events of 1280 x 720 pixels"),
         ("tum_vie", dict(frame_camera=RGB), "tum_vie holds cameras of the model fisheye, but one of radtan"),
-        ("event_recording", dict(frame_camera=replace(RGB, model="lookup")), "no table of directions"),
+        (
+            "event_recording",
+            dict(frame_camera=replace(CENTRED, model="lookup", directions=np.zeros((30, 40, 2)))),
+            "no table of directions",
+        ),
         ("event_recording", dict(event_from_frame=np.diag([1.0, 1, -1, 1])), "their rotation is no rotation"),
     ],
 )
 def test_what_a_layout_cannot_hold_is_refused(tmp_path: Path, layout: str, changes: dict, message: str):
-    with pytest.raises(RecordingError, match=message) as caught:
+    with pytest.raises(FlagError, match=message) as caught:
         open_writer(layout, tmp_path, setup_of(layout, **changes))
     assert str(caught.value).endswith(".") and "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,144 @@
+"""Recordings of any format, and event files of cameras' makers, made into recordings of the layout event_recording."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.files import read_json, write_whole
+from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.text_tables import read_poses
+from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
+
+
+def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:
+    """Copies all events, poses, frames and depth of a recording into a new folder of the layout event_recording.
+
+    Args:
+        source: Folder of a recording of any registered format; only read.
+        output_dir: New or empty folder, which is whole afterwards or not there.
+        options: Of the format, by name.
+
+    Returns:
+        What was found, and what is left out, in sentences.
+
+    Raises:
+        RecordingError: The recording cannot be used.
+        FlagError: The format lacks an option.
+        OutputError: The folder holds something, lies in the recording, or cannot be written.
+    """
+    with _new_folder(source, output_dir) as folder:
+        recording = read_recording(source, **options)  # type: ignore[arg-type]
+        num_events = event_recording.write(recording, folder)
+    num_poses = len(recording.trajectory.times)
+    num_frames = sum(len(frames.times) for frames in (recording.frames, recording.blurred_frames) if frames)
+    sentences = [
+        *recording.notes,
+        f"{num_events:,} events, {num_poses:,} poses and {num_frames:,} frames are written.",
+    ]
+    if recording.held_out_frames is not None:
+        views = len(recording.held_out_frames.times)
+        sentences.insert(0, f"{views:,} held-out views are left out, since they lie on a trajectory of their own.")
+    return sentences
+
+
+def convert_event_file(
+    source: Path,
+    output_dir: Path,
+    poses: Path | None = None,
+    poses_unit: Literal["s", "us", "ns"] = "s",
+    camera: Path | None = None,
+) -> list[str]:
+    """Writes the events of a file into a new folder of the layout event_recording, with poses and camera if given.
+
+    Args:
+        source: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4; only read.
+        output_dir: New or empty folder, which is whole afterwards or not there.
+        poses: Text file, t px py pz qx qy qz qw a line, on the clock of the event file; camera to world, OpenCV axes,
+            metres.
+        poses_unit: Of the times in it.
+        camera: JSON file with width, height, model, fx, fy, cx, cy and distortion.
+
+    Returns:
+        What was found, and what must be added before training, in sentences.
+
+    Raises:
+        RecordingError: A file cannot be used, or they do not fit together.
+        OutputError: The folder holds something or cannot be written.
+    """
+    sentences: list[str] = []
+    with _new_folder(source, output_dir) as folder:
+        file = open_event_file(source)
+        about = _camera_json(file, camera)
+        rows = read_poses(poses, poses_unit, sentences) if poses is not None else None
+        write_whole(folder / "recording.json", encode_json({"camera": about}))
+        if rows is not None:
+            event_recording.write_poses(folder / "poses.txt", rows[0] - file.start, *rows[1:])
+        num_events, last = event_recording.write_events(
+            file.stream(), folder / "events", about["width"], about["height"], lambda i: f"{source}, event {i + 1},"
+        )
+        if rows is not None and (rows[0][-1] < file.start or rows[0][0] > file.start + last):
+            raise RecordingError(
+                f"{poses} holds poses from {rows[0][0] * 1e-9:.6f} s to {rows[0][-1] * 1e-9:.6f} s, but the events of "
+                f"{source} lie from {file.start * 1e-9:.6f} s to {(file.start + last) * 1e-9:.6f} s; give both on one "
+                "clock, and the unit of the poses as --poses-unit."
+            )
+    sentences.append(
+        f"{num_events:,} events of {last * 1e-9:.3f} s ({file.encoding}) are written; their time 0, that of the first "
+        f"event, is {file.start} ns on the clock of the file."
+    )
+    missing = ["poses.txt"] * (poses is None)
+    missing += ["model, fx, fy, cx, cy and distortion of the camera in recording.json"] * (camera is None)
+    if missing:
+        sentences.append(
+            f"Before training, add {' and '.join(missing)}, as README.md shows under “Write a recording yourself”."
+        )
+    return sentences
+
+
+def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
+    """What recording.json is to say about the camera: all of its file, or the size of the sensor."""
+    if path is None:
+        if file.size is None:
+            raise RecordingError(
+                f"{file.path} does not state the size of its sensor; give a --camera file with width and height."
+            )
+        return {"width": file.size[0], "height": file.size[1]}
+    camera = event_recording.parse_camera(path, "camera", read_json(path))
+    if file.size not in (None, (camera.width, camera.height)):
+        raise RecordingError(
+            f"{path} is the calibration of {camera.width} x {camera.height} pixels, but {file.path} states a sensor of "
+            f"{file.size[0]} x {file.size[1]}; give the calibration for this resolution."
+        )
+    return camera_json(camera)
+
+
+@contextmanager
+def _new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
+    """A folder to write into that becomes the output at the end of the block, if nothing fails there."""
+    if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
+        raise OutputError(
+            f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
+        )
+    if output_dir == source or source in output_dir.parents:
+        raise FlagError(f"--output-dir {output_dir} lies in the recording, which is only read; give another one.")
+    partial = output_dir.with_name(f".{output_dir.name}.partial-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if output_dir.exists():
+            output_dir.rmdir()
+        partial.rename(output_dir)
+    except OSError as error:
+        raise OutputError(
+            f"{output_dir} could not be written ({error}), and nothing was left there; is the disk full?"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

@@ -1,0 +1,59 @@
+"""Values of JSON files, which may be of any type, with errors that name the file and the key."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from enerf_ns.dataparsers.errors import RecordingError
+
+LONGEST = 60
+"""Letters of a value that an error shows."""
+
+
+def parse_numbers(
+    path: Path, name: str, value: object, shape: tuple[int, ...], expected: str
+) -> Float64[np.ndarray, "..."]:
+    """Finite numbers of this shape from nested lists.
+
+    Args:
+        path: The file.
+        name: Of the value in the file.
+        value: What was found.
+        shape: () for one number.
+        expected: In words, such as "two numbers".
+
+    Raises:
+        RecordingError: It is something else.
+    """
+    try:
+        return parse_array(value, shape)
+    except ValueError as error:
+        raise RecordingError(f"{path} holds {name} = {shown(value)}, but {expected} were expected.") from error
+
+
+def parse_array(value: object, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    """Finite numbers of this shape from nested lists.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    array = np.array(value, dtype=object)
+    if array.shape != shape or not all(type(number) in (int, float) for number in array.flat):
+        raise ValueError(f"{shape} numbers were expected")
+    try:
+        numbers = array.astype(np.float64)
+    except OverflowError as error:
+        raise ValueError("a number is too large") from error
+    if not np.isfinite(numbers).all():
+        raise ValueError("finite numbers were expected")
+    return numbers
+
+
+def shown(value: object) -> str:
+    """A value as JSON writes it, on one line and no longer than an error should be."""
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
