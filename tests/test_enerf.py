@@ -21,8 +21,9 @@ from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.sensor.response import luma
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 WIDTH, HEIGHT = 32, 24
 
@@ -31,7 +32,9 @@ WIDTH, HEIGHT = 32, 24
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tenth of a second of a small camera, with grey frames, sharp and blurred, and depth."""
     folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate(folder, "shapes", width=WIDTH, height=HEIGHT, duration=0.1, num_frames=11, exposure_ms=5.0).main()
+    simulate(
+        SimulationSettings("shapes", width=WIDTH, height=HEIGHT, duration=0.1, num_frames=11, exposure_ms=5.0), folder
+    )
     return folder
 
 

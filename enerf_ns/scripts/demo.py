@@ -9,6 +9,7 @@ from pathlib import Path
 
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 
 @dataclass
@@ -34,7 +35,7 @@ class Demo:
         if recording.exists():
             CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.")
         else:
-            Simulate(recording, "shapes").main()
+            Simulate(recording, SimulationSettings("shapes")).main()
 
         config = copy.deepcopy(all_methods["enerf"])
         config.data = config.pipeline.datamanager.data = recording

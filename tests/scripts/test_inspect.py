@@ -30,7 +30,8 @@ from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.scripts import inspect
 from enerf_ns.scripts.inspect import Inspect, Inspection
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 VOID = {"meta", "img", "br"}
 
@@ -285,5 +286,5 @@ def test_simulated_recordings_have_no_problems(
     tmp_path: Path, scene: Literal["shapes", "carpet"], motion: Literal["shake", "spiral"]
 ):
     folder = tmp_path / "recording"
-    Simulate(folder, scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60).main()
+    simulate(SimulationSettings(scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60), folder)
     assert find_problems(read_recording(folder)) == []
