@@ -37,7 +37,7 @@ class Simulate:
         if self.log_eps is not None:
             if settings.sensor.response != SensorSettings().response:
                 raise FlagError(
-                    f"--log-eps {self.log_eps} contradicts --response {settings.sensor.response}; leave one of them out."
+                    f"--log-eps {self.log_eps} contradicts --response {settings.sensor.response}; leave one out."
                 )
             sensor = replace(settings.sensor, response=Logarithm(self.log_eps).name)
             settings = replace(settings, sensor=sensor)

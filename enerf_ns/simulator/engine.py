@@ -21,10 +21,9 @@ from enerf_ns.dataparsers.recording import Events
 from enerf_ns.sensor.response import colour_channels, luma, pixel_brightness, response_named
 from enerf_ns.simulator.event_sensor import EventSensor
 from enerf_ns.simulator.frames import Exposures, Frame
-from enerf_ns.simulator.layouts import LAYOUTS
 from enerf_ns.simulator.preview import Preview
 from enerf_ns.simulator.sampling import Render, adaptive_renders, render_times
-from enerf_ns.simulator.settings import SimulationSettings, resolve
+from enerf_ns.simulator.settings import SimulationSettings, layout_of, resolve
 from enerf_ns.simulator.sources import Pictures, RenderedScene, Source, TrainedRun
 from enerf_ns.simulator.view import View, view_of
 from enerf_ns.simulator.writers import Setup, Writer, open_writer
@@ -71,6 +70,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
         )
     settings, notes = resolve(settings), []
+    assert settings.layout is not None
     view = view_of(settings, notes)
     exposures = _exposures(settings, view)
     first = view.events.brightness(view.start)
@@ -92,7 +92,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
     with ExitStack() as stack:
         if is_new:
             stack.callback(_remove_if_empty, output_dir)
-        writer = stack.enter_context(open_writer(settings.layout or "", output_dir, setup))
+        writer = stack.enter_context(open_writer(settings.layout, output_dir, setup))
         video = None
         if preview:
             video = stack.enter_context(Preview(output_dir / "preview.mp4", view.events.width, view.events.height))
@@ -113,7 +113,7 @@ def _exposures(settings: SimulationSettings, view: View) -> Exposures:
     """Of frames that are evenly spread, in whole microseconds."""
     preset, length = settings.preset, view.end - view.start
     rate = preset.num_frames / preset.duration if preset else FRAME_RATE
-    fewest = LAYOUTS[settings.layout or ""].fewest_frames
+    fewest = layout_of(settings).fewest_frames
     count = settings.num_frames or max(fewest, round(rate * length * 1e-9))
     exposure_ms = settings.exposure_ms
     if exposure_ms is None:
@@ -257,7 +257,7 @@ class _Recorder:
 
     def __init__(self, settings: SimulationSettings, exposures: Exposures, writer: Writer, preview: Preview | None):
         self._writer, self._preview = writer, preview
-        is_cut = LAYOUTS[settings.layout or ""].ends_before_last_frame
+        is_cut = layout_of(settings).ends_before_last_frame
         self._until = int(exposures.times[-1]) - 1000 if is_cut else None
 
     def add_events(self, events: Events) -> None:

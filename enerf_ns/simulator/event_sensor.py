@@ -1,9 +1,9 @@
 """Events from pictures of brightness: the pixels of an event sensor, ideal but for what its settings say.
 
-The signal of a pixel is its log brightness, by the sensor's response, linear in time between two pictures. A pixel memorises a level of its
-signal; when the signal has risen above it by the on threshold, or fallen below it by the off threshold, the pixel fires
-and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018, section 3.1), and every
-crossing is timed to the nanosecond. The rest is off by default:
+The signal of a pixel is its log brightness, by the sensor's response, linear in time between two pictures. A pixel
+memorises a level of its signal; when the signal has risen above it by the on threshold, or fallen below it by the off
+threshold, the pixel fires and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018,
+section 3.1), and every crossing is timed to the nanosecond. The rest is off by default:
 
 * Refractory period: after an event a pixel neither fires nor memorises for that long; then it memorises the signal of
   that moment (Low, Lee: Robust e-NeRF, ICCV 2023).

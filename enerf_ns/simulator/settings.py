@@ -12,7 +12,7 @@ import tyro
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
-from enerf_ns.simulator.layouts import LAYOUTS
+from enerf_ns.simulator.layouts import LAYOUTS, Layout
 from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -121,6 +121,12 @@ def resolve(settings: SimulationSettings) -> SimulationSettings:
     if thresholds:
         sensor = replace(sensor, contrast_thresholds=thresholds)
     return replace(settings, layout=layout, sensor=sensor)
+
+
+def layout_of(settings: SimulationSettings) -> Layout:
+    """What the layout of settings that were resolved asks of the simulation."""
+    assert settings.layout is not None
+    return LAYOUTS[settings.layout]
 
 
 def _check_ranges(settings: SimulationSettings) -> None:

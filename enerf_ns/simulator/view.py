@@ -13,13 +13,12 @@ from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.formats.event_recording import read_cameras
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.sensor.response import response_named
-from enerf_ns.simulator.layouts import LAYOUTS
 from enerf_ns.simulator.paper_sequences import PRESETS
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scene_files import load_scene
 from enerf_ns.simulator.scene.scenes import SCENES, Scene
 from enerf_ns.simulator.scene.view_check import check_view
-from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.settings import SimulationSettings, layout_of
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, Source, TrainedRun, Video
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
 from enerf_ns.simulator.writers import is_second_camera
@@ -138,7 +137,7 @@ def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator
     elif trajectory is None:
         motion, duration = MOTIONS[settings.motion or "shake"], _duration(settings) or round(SECONDS * 1e9)
         trajectory = motion(duration, scene.camera, scene.target, rng)
-    poses_per_second = LAYOUTS[settings.layout or ""].poses_per_second
+    poses_per_second = layout_of(settings).poses_per_second
     if poses_per_second is None:
         return trajectory
     thinned, given = sampled(trajectory, poses_per_second), settings.trajectory or settings.key_frames
@@ -160,7 +159,7 @@ def _given_trajectory(settings: SimulationSettings, notes: list[str]) -> Traject
 
 def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
     """Of events and of frames, and the pose of the latter in the axes of the former."""
-    rig = LAYOUTS[settings.layout or ""].published_rig
+    rig = layout_of(settings).published_rig
     if settings.cameras is not None:
         rig = read_cameras(settings.cameras.expanduser())
     elif rig is None:

@@ -133,9 +133,7 @@ def test_the_compiled_inverse_is_that_of_the_response(response, offset):
 def test_events_of_linlog_add_up_to_its_differences(threshold):
     """Of 255 b: b ln(20) / 20 in the dark and ln(b) above 20, to a threshold; at the times of the crossings."""
     grey = np.array([0.0, 3.0, 19.9, 20.0, 40.0, 200.0])
-    log_brightness = np.array(
-        [0.0, 0.15 * math.log(20), 0.995 * math.log(20), math.log(20), math.log(40), math.log(200)]
-    )
+    log_brightness = np.array([*(math.log(20) / 20 * grey[:3]), *np.log(grey[3:])])
     settings = SensorSettings(contrast_thresholds=(threshold, threshold), response="linlog")
     for first, second in itertools.product(range(len(grey)), repeat=2):
         sensor = EventSensor(settings, grey[first].reshape(1, 1) / 255, 0)
@@ -779,9 +777,7 @@ def test_settings_that_no_sensor_has_are_refused(wrong):
 
 @pytest.mark.parametrize("wrong", ["logarithm:0.0", "logarithm", "linear", ""])
 def test_responses_that_no_sensor_has_are_refused(wrong):
-    with pytest.raises(
-        FlagError, match=f"^--response names the response '{wrong}', but linlog, or .* was expected\\.$"
-    ):
+    with pytest.raises(FlagError, match=f"^--response names the response '{wrong}', but linlog, or .* expected\\.$"):
         SensorSettings(response=wrong)
 
 

@@ -322,7 +322,8 @@ def test_few_times_and_times_next_to_each_other(times, between):
 
 
 def test_black_that_becomes_less_black_is_rendered_between_as_any_other_change():
-    """From 0 to the offset of the logarithm within an interval; in its first half by ln 1.5, and in the second it still bends too much."""
+    """From 0 to the logarithm's offset within an interval; in its first half by ln 1.5, and in the second it still
+    bends too much."""
     brightness = np.array([0.0, 0.001, 0.001, 0.001])
 
     def dark(times: np.ndarray) -> np.ndarray:
