@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from functools import cache
@@ -398,7 +399,8 @@ def test_another_process_makes_the_same_events_of_the_same_seed_and_others_of_an
     one = events_written(recorded(tmp_path / "one", seed=5))
     other = tmp_path / "other"
     code = f"from test_simulation_proofs import recorded, Path; recorded(Path({str(other)!r}), seed=5)"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
+    paths = os.pathsep.join(path for path in sys.path if path)
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": paths})
     np.testing.assert_array_equal(events_written(other), one)
     different = events_written(recorded(tmp_path / "different", seed=6))
     assert len(one) > 1000 and (len(different) != len(one) or (different != one).any())
