@@ -20,9 +20,8 @@ test: lint
 lint: $(STAMP)
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
-	rm -rf build/typecheck && mkdir -p build/typecheck/enerf_ns
-	ln -s "$(CURDIR)"/enerf_ns/* "$(CURDIR)"/dataparsers build/typecheck/enerf_ns
-	ln -s "$(CURDIR)"/tests "$(CURDIR)"/benchmarks "$(CURDIR)"/pyproject.toml build/typecheck
+	rm -rf build && .venv/bin/python -m pip install --quiet --no-deps --no-build-isolation --no-compile \
+	    --target build/typecheck . && cp -r tests benchmarks pyproject.toml build/typecheck
 	cd build/typecheck && PYRIGHT_PYTHON_IGNORE_WARNINGS=1 ../../.venv/bin/pyright --pythonpath ../../.venv/bin/python
 
 format: $(STAMP)

@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 
 from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.sampling import adaptive_renders, render_times
 from enerf_ns.simulator.scene.render import Renderer
@@ -73,7 +74,7 @@ def main(scenes: tuple[SceneName, ...] = ("shapes", "roads", "moon")) -> None:
 
 
 def log_brightness(picture: np.ndarray) -> np.ndarray:
-    return np.log(picture.ravel().astype(np.float64) + SensorSettings().log_eps)
+    return Logarithm()(picture.ravel().astype(np.float64))
 
 
 def simulated(source: RenderedScene, max_displacement: float, max_change: float) -> tuple:

@@ -43,6 +43,9 @@ INVERSION_STEPS = 60
 """Of a table of directions; each halves the error where the table is even, and lessens it up to fourfold stretching."""
 
 
+CameraModel = Literal["pinhole", "radtan", "fisheye", "lookup"]
+
+
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres.
@@ -64,7 +67,7 @@ class Camera:
     cy: float
     distortion: tuple[float, ...] = ()
     """radtan: k1, k2, p1, p2 and, if given, k3 (Brown-Conrady); fisheye: k1 to k4 (Kannala-Brandt)."""
-    model: Literal["pinhole", "radtan", "fisheye", "lookup"] = "pinhole"
+    model: CameraModel = "pinhole"
     directions: Float64[np.ndarray, "height width 2"] | None = field(default=None, compare=False)
     """For lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted camera."""
 
@@ -190,7 +193,8 @@ class Camera:
         if self.model == "pinhole":
             return image
         if self.model == "lookup":
-            return cv2.remap(image, self._seen_by, None, cv2.INTER_LINEAR).reshape(image.shape)
+            column, row = cv2.split(self._seen_by)
+            return cv2.remap(image, column, row, cv2.INTER_LINEAR).reshape(image.shape)
         matrix, coefficients = self.undistorted().matrix, np.array(self.distortion)
         if self.model == "fisheye":
             return cv2.fisheye.undistortImage(image, self.matrix, coefficients, Knew=matrix).reshape(image.shape)
@@ -208,7 +212,8 @@ class Camera:
         wanted = np.dstack([columns, rows])
         place = wanted.copy()
         for _ in range(INVERSION_STEPS):
-            place += 0.5 * (wanted - cv2.remap(table, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+            column, row = cv2.split(place)
+            place += 0.5 * (wanted - cv2.remap(table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return place
 
 

@@ -75,8 +75,8 @@ class EventDataParser(DataParser):
     def recording(self) -> EventRecording:
         """The recording of this parser's folder, read once per process."""
         config = self.config
-        selection = config.time_range and tuple(config.time_range), config.keep_hot_pixels
-        return read_recording(config.data, config.format, *selection, **vars(config.options))
+        time_range = config.time_range and (config.time_range[0], config.time_range[1])  # a list, from some YAML
+        return read_recording(config.data, config.format, time_range, config.keep_hot_pixels, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         with exit_with_a_sentence():

@@ -93,7 +93,8 @@ def survey_events(stream: EventStream, width: int, height: int, start: int, end:
         if fault:
             number = survey.num_events + place
             survey.outside, survey.backwards, survey.odd_polarity = (number if fault == i else None for i in (1, 2, 3))
-            survey.odd_event = tuple(int(column[place]) for column in (events.x, events.y, events.t, events.p))
+            x, y, t, p = (int(column[place]) for column in (events.x, events.y, events.t, events.p))
+            survey.odd_event = x, y, t, p
             survey.last = int(state[0])
             break
         survey.num_events += len(events)

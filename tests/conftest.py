@@ -47,10 +47,11 @@ def device(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tenth of a second of a small camera, with grey frames, sharp and blurred, and depth."""
-    from enerf_ns.scripts.simulate import Simulate
+    from enerf_ns.simulator.engine import simulate
+    from enerf_ns.simulator.settings import SimulationSettings
 
     folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate(folder, "shapes", width=32, height=24, duration=0.1, num_frames=11, exposure_ms=5.0).main()
+    simulate(SimulationSettings("shapes", width=32, height=24, duration=0.1, num_frames=11, exposure_ms=5.0), folder)
     return folder
 
 

@@ -68,7 +68,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
     def mosaic(time: int) -> np.ndarray:
         return np.exp(np.take_along_axis(picture(time), seen[..., None], axis=-1)[..., 0])
 
-    sensor = EventSensor(SensorSettings(contrast_thresholds=THRESHOLDS, log_eps=1e-9), mosaic(0), 0)
+    sensor = EventSensor(SensorSettings(contrast_thresholds=THRESHOLDS, response="logarithm:1e-9"), mosaic(0), 0)
     times = np.arange(1, 1001) * (SECOND // 1000)
     events = joined(sensor.advance(mosaic(time), time) for time in times.tolist())
     np.save(folder / "events.npy", np.stack([events.x, events.y, events.t, events.p], axis=1))

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from enerf_ns.dataparsers.camera import Camera, check_rotation
+from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format
@@ -58,7 +58,7 @@ CLOCK_START = 1000 * 10**9
 OFFSET_TOLERANCE = 2000
 """ns by which the preparation may round a time."""
 
-KALIBR_MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
+KALIBR_MODELS: dict[str, CameraModel] = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
 """Kalibr's names of the distortion models, and ours."""
 
 PUBLISHED_RGB_CAMERA = Camera(

@@ -220,7 +220,7 @@ def parse_camera(path: Path, name: str, value: object, directions_file: Path | N
         )
     _check_keys(path, value, CAMERA_KEYS, ("distortion",), f" in {name}")
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    lens = parse_numbers(
+    width, height, fx, fy, cx, cy = parse_numbers(
         path, f"{name} ({', '.join(names)})", [value[key] for key in names], (6,), "numbers of pixels"
     ).tolist()
     model = value["model"]
@@ -230,14 +230,13 @@ def parse_camera(path: Path, name: str, value: object, directions_file: Path | N
     coefficients = value.get("distortion", [])
     shape = (len(coefficients) if isinstance(coefficients, list) else 0,)
     distortion = parse_numbers(path, f"{name}.distortion", coefficients, shape, "numbers").tolist()
-    if model != "lookup":
-        with of_file(f"{path}, {name},"):
-            return Camera(*lens, tuple(distortion), model)
-    assert directions_file is not None
     with of_file(f"{path}, {name},"):
-        undistorted = Camera(*lens, tuple(distortion))
+        camera = Camera(width, height, fx, fy, cx, cy, tuple(distortion), "pinhole" if model == "lookup" else model)
+    if model != "lookup":
+        return camera
+    assert directions_file is not None
     with of_file(directions_file):
-        return replace(undistorted, model="lookup", directions=load_array(directions_file).astype(np.float64))
+        return replace(camera, model="lookup", directions=load_array(directions_file).astype(np.float64))
 
 
 def _open_columns(folder: Path) -> dict[str, np.memmap]:

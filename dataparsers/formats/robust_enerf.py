@@ -128,7 +128,7 @@ def checked_camera(
     Raises:
         RecordingError: The matrix is not of this form, the distortion is of another model, or all this is no camera.
     """
-    size: Any = width, height
+    size: tuple[Any, Any] = width, height  # which Camera makes whole
     fx, skew, cx, _, fy, cy = matrix[:2].ravel().astype(float).tolist()
     if not (np.isfinite(matrix).all() and skew == matrix[1, 0] == 0):
         raise RecordingError(
@@ -145,7 +145,7 @@ def checked_camera(
             "was expected; undistort the events and frames, or fit one of these."
         )
     with of_file(path):
-        return Camera(*size, fx, fy, cx, cy, coefficients, model)
+        return Camera(size[0], size[1], fx, fy, cx, cy, coefficients, model)
 
 
 def whole_nanoseconds(path: Path, refractory_period: float) -> int:

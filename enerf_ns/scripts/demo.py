@@ -11,6 +11,7 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.report import write_report
 from enerf_ns.evaluation.runs import method_config, train
 from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 
 @dataclass
@@ -28,7 +29,7 @@ class Demo:
         if recording.exists():
             CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.", markup=False)
         else:
-            Simulate(recording, "shapes").main()
+            Simulate(recording, SimulationSettings("shapes")).main()
 
         config = method_config("enerf", recording, output_dir / "runs")
         config.steps_per_eval_image = config.steps_per_eval_batch

@@ -1,21 +1,27 @@
 """How a pixel answers brightness: what it sees of colours, and the logarithm that it compares.
 
-Brightness is linear radiance, usually in [0, 1]. The field and the simulator use the same functions; each works on
-tensors of any shape and type of float, and is differentiable.
+Brightness is linear radiance, usually in [0, 1]. The field and the simulator use the same functions. Responses work on
+tensors and NumPy arrays of any shape and type of float, and what they return is of the same kind: PyTorch's are
+differentiable, and NumPy's logarithm of a number is the same whatever the number of threads. The other functions take
+tensors.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 LINEAR_UNTIL = 20.0
 """B of the paper: linlog is linear below this brightness (of 255) and logarithmic above."""
+
+Array = TypeVar("Array", Tensor, np.ndarray)
+"""Of PyTorch or of NumPy."""
 
 SMALLEST_OFFSET, LARGEST_OFFSET = 1e-9, 1.0
 """Of `Logarithm`."""
@@ -29,11 +35,11 @@ class Response(Protocol):
         """As `response_named` reads it."""
         ...
 
-    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Log brightness, in the units in which contrast thresholds are."""
         ...
 
-    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Linear brightness whose log brightness is the argument."""
         ...
 
@@ -47,11 +53,11 @@ class Linlog:
         """As `response_named` reads it."""
         return "linlog"
 
-    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """As of `linlog`."""
         return linlog(brightness)
 
-    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """As of `inverse_linlog`."""
         return inverse_linlog(log_brightness)
 
@@ -67,13 +73,13 @@ class Logarithm:
         """As `response_named` reads it."""
         return f"logarithm:{self.offset!r}"
 
-    def __call__(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Log brightness; of brightness above -offset."""
-        return torch.log(brightness + self.offset)
+        return _library(brightness).log(brightness + self.offset)
 
-    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Linear brightness whose log brightness is the argument."""
-        return torch.exp(log_brightness) - self.offset
+        return _library(log_brightness).exp(log_brightness) - self.offset
 
 
 def response_named(name: str) -> Response:
@@ -97,7 +103,7 @@ def response_named(name: str) -> Response:
     return Logarithm(offset)
 
 
-def linlog(brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def linlog(brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Log brightness of E-NeRF: I ln(B)/B below B, ln(I) above, with I = 255 * brightness and B = 20.
 
     Continuous and increasing, with slope ln(B)/B per grey level at zero; its slope jumps to 1/B at B (equation 2 of the
@@ -108,14 +114,22 @@ def linlog(brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """
     level = 255.0 * brightness
     slope = math.log(LINEAR_UNTIL) / LINEAR_UNTIL
-    return torch.where(level < LINEAR_UNTIL, level * slope, torch.log(level.clamp(min=LINEAR_UNTIL)))
+    library = _library(brightness)
+    return library.where(level < LINEAR_UNTIL, level * slope, library.log(library.clip(level, LINEAR_UNTIL, None)))
 
 
-def inverse_linlog(log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def inverse_linlog(log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Linear brightness whose `linlog` is the argument."""
     slope = math.log(LINEAR_UNTIL) / LINEAR_UNTIL
     knee = math.log(LINEAR_UNTIL)
-    return torch.where(log_brightness < knee, log_brightness / slope, torch.exp(log_brightness.clamp(min=knee))) / 255.0
+    library = _library(log_brightness)
+    above = library.exp(library.clip(log_brightness, knee, None))
+    return library.where(log_brightness < knee, log_brightness / slope, above) / 255.0
+
+
+def _library(values: Tensor | np.ndarray) -> Any:
+    """The module whose functions take these values."""
+    return torch if isinstance(values, Tensor) else np
 
 
 LUMA = (0.299, 0.587, 0.114)

@@ -1,9 +1,9 @@
 """Events from pictures of brightness: the pixels of an event sensor, ideal but for what its settings say.
 
-The signal of a pixel is its log brightness, linear in time between two pictures. A pixel memorises a level of its
-signal; when the signal has risen above it by the on threshold, or fallen below it by the off threshold, the pixel fires
-and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018, section 3.1), and every
-crossing is timed to the nanosecond. The rest is off by default:
+The signal of a pixel is its log brightness, by the sensor's response, linear in time between two pictures. A pixel
+memorises a level of its signal; when the signal has risen above it by the on threshold, or fallen below it by the off
+threshold, the pixel fires and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018,
+section 3.1), and every crossing is timed to the nanosecond. The rest is off by default:
 
 * Refractory period: after an event a pixel neither fires nor memorises for that long; then it memorises the signal of
   that moment (Low, Lee: Robust e-NeRF, ICCV 2023).
@@ -33,8 +33,9 @@ import tyro
 from jaxtyping import Float, Int64
 
 from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording import Events
+from enerf_ns.sensor.response import LINEAR_UNTIL, Logarithm, response_named
 
 READOUT_QUEUE = 1000
 """Events that may wait for the bus; one that comes while so many wait is lost."""
@@ -48,6 +49,9 @@ CUT_JITTER = 6
 TOLERANCE = 1e-9
 """Log brightness by which a threshold may be missed and still be reached: far above rounding, far below any noise."""
 
+KNEE = math.log(LINEAR_UNTIL)
+"""Log brightness up to which linlog is linear."""
+
 LEAST_THRESHOLD = 0.001
 """Change of log brightness; sensors have more than ten times as much, and events beyond number would follow."""
 
@@ -60,7 +64,7 @@ class SensorSettings:
     """What an event sensor is like; by default ideal.
 
     Raises:
-        RecordingError: A setting is out of its range.
+        FlagError: A setting is out of its range.
     """
 
     contrast_thresholds: tyro.conf.Suppress[tuple[float, float]] = (0.25, 0.25)
@@ -83,8 +87,9 @@ class SensorSettings:
     """Standard deviation of the times of events in nanoseconds; they are put in order after that."""
     readout_rate: float = 0.0
     """Events per second that the bus carries; they wait in a queue for it, and are lost when that is full. 0: all."""
-    log_eps: float = 0.001
-    """Added to brightness before its logarithm is taken."""
+    response: str = Logarithm().name
+    """How log brightness comes of brightness: logarithm:OFFSET, which adds the offset to it and takes the logarithm, or
+    linlog, as E-NeRF has it."""
     seed: int = 0
     """Draws all that is random."""
 
@@ -94,14 +99,18 @@ class SensorSettings:
             if field.name == "contrast_thresholds":
                 fine = len(value) == 2 and all(LEAST_THRESHOLD <= c < math.inf for c in value)
                 expected = f"two numbers of at least {LEAST_THRESHOLD}"
-            elif field.name == "log_eps":
-                fine, expected = 0 < value < math.inf, "above 0"
+            elif field.name == "response":
+                try:
+                    response_named(value)
+                except ValueError as error:
+                    raise FlagError(f"--response names {error}") from error
+                continue
             elif field.name == "hot_pixels":
                 fine, expected = 0 <= value <= 1, "between 0 and 1"
             else:
                 fine, expected = 0 <= value <= 1e15, "at least 0 and at most 1e15"
             if not fine:
-                raise RecordingError(f"{field.name} is {value}, but must be {expected}.")
+                raise FlagError(f"{field.name} is {value}, but must be {expected}.")
 
 
 class PartialPicture(NamedTuple):
@@ -156,12 +165,13 @@ class EventSensor:
         hot_pixels: int64 [N], their pixel numbers (y * width + x), in order.
 
     Raises:
-        RecordingError: The spread of the thresholds leaves pixels without a threshold, or the picture has a value that
-            is negative or not finite.
+        FlagError: The spread of the thresholds leaves pixels without a threshold.
+        RecordingError: The picture has a value that is negative or not finite.
     """
 
     def __init__(self, settings: SensorSettings, brightness: Float[np.ndarray, "height width"], time: int):
         self.settings, self.start, self.time = settings, int(time), int(time)
+        self._response = response_named(settings.response)
         self.height, self.width = brightness.shape
         size = brightness.size
         drawn = np.random.SeedSequence([settings.seed, SENSOR])
@@ -170,14 +180,14 @@ class EventSensor:
         self.contrast_thresholds = spread * np.array(settings.contrast_thresholds)[:, None, None]
         without = np.count_nonzero((self.contrast_thresholds < LEAST_THRESHOLD).any(0))
         if without:
-            raise RecordingError(
+            raise FlagError(
                 f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
                 f"threshold of {LEAST_THRESHOLD} or more; give a smaller one."
             )
         self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))
         self._keys = drawn.generate_state(4, np.uint64)
         self._all = np.arange(size)
-        self._log_brightness = self._logarithm(brightness, self._all, self.time)
+        self._log_brightness = self._respond(brightness, self._all, self.time)
 
         on, off = self.contrast_thresholds.reshape(2, size)
         hot = np.zeros(size, bool)
@@ -250,11 +260,12 @@ class EventSensor:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Events of some pixels from when they were seen last, which becomes this time."""
         settings = self.settings
-        seen = self._logarithm(brightness, pixels, time)
+        now = self._respond(brightness, pixels, time)
+        offset = self._response.offset if isinstance(self._response, Logarithm) else math.nan
         cutoff = 2e-9 * math.pi * settings.cutoff_frequency
         return _fire(
-            self._pixels, self._keys, pixels, self._log_brightness, seen, self.start, since, time,
-            settings.log_eps, cutoff, int(settings.refractory_period), settings.timestamp_jitter,
+            self._pixels, self._keys, pixels, self._log_brightness, now, self.start, since, time,
+            offset, cutoff, int(settings.refractory_period), settings.timestamp_jitter,
         )  # fmt: skip
 
     def finish(self) -> Events:
@@ -280,8 +291,8 @@ class EventSensor:
         y, x = np.divmod(pixel[sent].astype(np.int32), np.int32(self.width))
         return Events(x, y, times[sent], polarity[sent])
 
-    def _logarithm(self, brightness: np.ndarray, pixels: np.ndarray, time: int) -> np.ndarray:
-        """float64 [pixels]."""
+    def _respond(self, brightness: np.ndarray, pixels: np.ndarray, time: int) -> np.ndarray:
+        """Log brightness, float64 [pixels]."""
         flat = brightness.ravel()
         if not (flat.min(initial=0) >= 0 and flat.max(initial=0) < math.inf):
             wrong = int(np.argmin((flat >= 0) & (flat < math.inf)))
@@ -290,17 +301,18 @@ class EventSensor:
                 f"The picture at {time} ns is {flat[wrong]} at x = {x}, y = {y}, but brightness must be finite and at "
                 "least 0."
             )
-        return np.log(flat.astype(np.float64) + self.settings.log_eps)
+        return self._response(flat.astype(np.float64))
 
 
 @compiled
 def _fire(  # pragma: no cover
-    pixels, keys, which, seen, now, first, since, end, log_eps, cutoff, refractory_period, jitter
+    pixels, keys, which, seen, now, first, since, end, offset, cutoff, refractory_period, jitter
 ):
     """Pixels, times and polarities of events from when each of some pixels was last `seen`, `since`, up to `end`.
 
     They are in the order of `which`. Moves these pixels on to `end`, when they see `now`. Within the interval, times
     are nanoseconds since its start: `s` is when a pixel's memory was last moved, `awake` and `noise` as in `_Pixels`.
+    `offset` as of `_brightness`.
     """
     count = 0
     pixel, times, polarity = np.empty(4096, np.int64), np.empty(4096, np.int64), np.empty(4096, np.int8)
@@ -312,7 +324,7 @@ def _fire(  # pragma: no cover
         decay = 0.0
         if cutoff > 0:
             y0 = pixels.signal[i]
-            decay = cutoff * (255 * (np.exp((x0 + x1) / 2) - log_eps) + 20) / 275
+            decay = cutoff * (255 * _brightness((x0 + x1) / 2, offset) + 20) / 275
         leak, leaked = pixels.leak[i], pixels.leak[i] * (start - first)
         curve = y0 + leaked, x0 - y0, (x1 - x0) / duration, leak, decay
         if cutoff > 0:
@@ -353,7 +365,7 @@ def _fire(  # pragma: no cover
             if fired == 0:
                 if noise > duration:
                     break
-                here = np.exp(x0 + (x1 - x0) * (noise / duration)) - log_eps
+                here = _brightness(x0 + (x1 - x0) * (noise / duration), offset)
                 chance = 1.0 if pixels.hot[i] else 1 - 0.75 * min(here, 1.0)
                 draw = _random(keys[1], i, pixels.num_noise[i])
                 if awake <= noise and _uniform(draw) <= chance:
@@ -372,6 +384,14 @@ def _fire(  # pragma: no cover
             count += 1
         pixels.awake[i], pixels.noise[i] = start + awake, start + noise
     return pixel[:count], times[:count], polarity[:count]
+
+
+@compiled
+def _brightness(level, offset):  # pragma: no cover
+    """Compiled twin of `Response.inverse` for one number: of `Logarithm` or, where the offset is nan, of `Linlog`."""
+    if not np.isnan(offset):
+        return np.exp(level) - offset
+    return (level * (LINEAR_UNTIL / KNEE) if level < KNEE else np.exp(level)) / 255
 
 
 @compiled

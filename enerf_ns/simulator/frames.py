@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError
 
 MOST_LEVEL = 1e6
 """Of what is white; pixels brighter than this have the noise of this."""
@@ -18,7 +18,7 @@ class FrameSettings:
     """The sensor of the frames.
 
     Raises:
-        RecordingError: A setting is out of its range.
+        FlagError: A setting is out of its range.
     """
 
     saturation: float = 1.0
@@ -38,7 +38,7 @@ class FrameSettings:
         ):
             if not fine:
                 value = getattr(self, name.replace(" ", "_"))
-                raise RecordingError(f"The {name} of frames is {value:g}, but {expected} was expected.")
+                raise FlagError(f"The {name} of frames is {value:g}, but {expected} was expected.")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Exposures:
         exposure: How long each lasts (ns); 0 for sharp frames alone.
 
     Raises:
-        RecordingError: The exposure is negative, or longer than from one frame to the next.
+        FlagError: The exposure is negative, or longer than from one frame to the next.
     """
 
     def __init__(self, times: Int64[np.ndarray, " frames"], exposure: int):
@@ -75,7 +75,7 @@ class Exposures:
         self.closes = self.opens + exposure
         interval = int(np.diff(times).min(initial=np.iinfo(np.int64).max))
         if not 0 <= exposure <= interval:
-            raise RecordingError(
+            raise FlagError(
                 f"The exposure of {exposure * 1e-6:g} ms does not fit frames {interval * 1e-6:g} ms apart; give "
                 "--exposure-ms from 0 up to that, or less --num-frames."
             )

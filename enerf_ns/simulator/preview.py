@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import in_colour
 from enerf_ns.dataparsers.recording import Events
 
@@ -52,7 +52,7 @@ class Preview:
             depth: Metres, 0 where nothing is.
 
         Raises:
-            RecordingError: The video cannot be written.
+            OutputError: The video cannot be written.
         """
         height = sharp.shape[0]
         events_width = round(self._events.shape[1] * height / self._events.shape[0])
@@ -107,7 +107,7 @@ class Preview:
         levels = np.rint(255 * share.clip(0, 1)).astype(np.uint8)
         return np.where(seen[..., None], cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1], 0).astype(np.uint8)
 
-    def _failure(self) -> RecordingError:
-        return RecordingError(
+    def _failure(self) -> OutputError:
+        return OutputError(
             f"{self.path} could not be written as a video; make room on the disk or simulate without --preview."
         )

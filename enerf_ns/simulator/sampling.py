@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Int64
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.sensor.response import Logarithm, Response
 from enerf_ns.simulator.event_sensor import PartialPicture
 from enerf_ns.simulator.scene.render import pixel_steps
 
@@ -113,7 +114,7 @@ def adaptive_renders(
     brightness: Callable[[int, Int64[np.ndarray, " pixels"] | None], Float[np.ndarray, "*pixels"]],
     times: Int64[np.ndarray, " times"],
     max_change: float = MAX_CHANGE,
-    log_eps: float = 0.001,
+    response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
     threads: int | None = None,
 ) -> Iterator[Render]:
     """Pictures at the given times, and between them the pixels of which they do not tell enough.
@@ -131,8 +132,8 @@ def adaptive_renders(
     Args:
         brightness: As of `sources.Source`. Called from several threads.
         times: Nanoseconds, strictly increasing; whole pictures are rendered at these and no others.
-        max_change: Of the natural logarithm of log_eps + brightness; infinite: nothing is rendered between pictures.
-        log_eps: Above 0.
+        max_change: Of log brightness; infinite: nothing is rendered between pictures.
+        response: How log brightness comes of brightness.
         threads: How many render at once. None: as many as PyTorch uses.
 
     Yields:
@@ -157,14 +158,14 @@ def adaptive_renders(
             return []
         around = range(max(0, index - 2), min(len(times), index + 2))
         seen = [pictures[i].result() for i in around]
-        levels = [np.log(picture.reshape(picture.shape[0] * picture.shape[1], -1) + log_eps) for picture in seen]
-        ends = slice(index - 1 - around[0], index + 1 - around[0])
+        levels = [response(picture.reshape(picture.shape[0] * picture.shape[1], -1)) for picture in seen]
+        before, after = levels[index - 1 - around[0]], levels[index - around[0]]
         start, end = times[index - 1 : index + 1].tolist()
         error = np.zeros_like(levels[0])
         for i in range(len(around) - 2):
             bend = _bend(times[around[i : i + 3]] * 1.0, levels[i : i + 3])
             np.maximum(error, bend * np.float32((end - start) ** 2 / 8), out=error)
-        return between(start, end, np.arange(len(error)), *levels[ends], error)
+        return between(start, end, np.arange(len(error)), before, after, error)
 
     def between(
         start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, error: np.ndarray, halvings=0
@@ -176,7 +177,7 @@ def adaptive_renders(
             return []
         pixels, before, after = pixels[wrong], before[wrong], after[wrong]
         picture = PartialPicture(middle, pixels, brightness(middle, pixels))
-        here = np.log(picture.brightness.reshape(before.shape) + log_eps)
+        here = response(picture.brightness.reshape(before.shape))
         error = np.abs(before - 2 * here + after) / 8
         return [
             *between(start, middle, pixels, before, here, error, halvings + 1),

@@ -16,12 +16,13 @@ from jaxtyping import Float, Float32, Int64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import image_size, load_image
 from enerf_ns.dataparsers.formats.text_tables import read_times
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.evaluation.runs import load_any_method
+from enerf_ns.sensor.response import Logarithm, Response
 
 if TYPE_CHECKING:
     from enerf_ns.simulator.scene.render import Renderer
@@ -41,14 +42,20 @@ OPENGL_AXES = np.array([1.0, -1.0, -1.0, 1.0])
 class Source(Protocol):
     """A picture at any time."""
 
-    width: int
-    """Pixels."""
-    height: int
-    """Pixels."""
     start: int
     """First time at which it can be seen, ns."""
     end: int
     """Last time at which it can be seen, ns."""
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        ...
 
     def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
         """Linear brightness, 0 or more, grey [height, width] or R G B [height, width, 3].
@@ -86,14 +93,14 @@ class Pictures(ABC):
         path: Where they are.
         times: ns, strictly increasing from 0, of at least two pictures.
         gamma: Whether their values are sRGB, else linear.
-        log_eps: What the sensor adds to the brightness before its logarithm is taken.
+        response: How log brightness comes of brightness.
     """
 
     width: int
     height: int
 
-    def __init__(self, path: Path, times: Int64[np.ndarray, " pictures"], gamma: bool, log_eps: float):
-        self.path, self.times, self.gamma, self.log_eps = path, times, gamma, log_eps
+    def __init__(self, path: Path, times: Int64[np.ndarray, " pictures"], gamma: bool, response: Response):
+        self.path, self.times, self.gamma, self.response = path, times, gamma, response
         self.start, self.end = 0, int(times[-1])
         self._linear = lru_cache(maxsize=4)(self._load_linear)
 
@@ -116,9 +123,9 @@ class Pictures(ABC):
         if time == self.times[before]:
             picture = first.copy()
         else:
-            first, second = np.log(self.log_eps + first), np.log(self.log_eps + self._linear(before + 1))
+            first, second = self.response(first), self.response(self._linear(before + 1))
             passed = (time - self.times[before]) / (self.times[before + 1] - self.times[before])
-            picture = np.maximum(np.exp(first + np.float32(passed) * (second - first)) - np.float32(self.log_eps), 0)
+            picture = np.maximum(self.response.inverse(first + np.float32(passed) * (second - first)), 0)
         return picture if pixels is None else picture.reshape(-1, *picture.shape[2:])[pixels]
 
     def _load_linear(self, index: int) -> np.ndarray:
@@ -136,11 +143,12 @@ class ImageFolder(Pictures):
         stamps: Text file with the time of each picture, a line each; the first one becomes time 0.
         unit: Of these times, "s", "us" or "ns".
         gamma: As of `Pictures`.
-        log_eps: As of `Pictures`.
+        response: As of `Pictures`.
 
     Raises:
         RecordingError: No folder, fewer than two pictures, pictures of several sizes, a first one that cannot be read,
-            neither times nor a frame rate or both, or not one time a picture.
+            or not one time a picture.
+        FlagError: Neither times nor a frame rate, or both.
     """
 
     def __init__(
@@ -150,7 +158,7 @@ class ImageFolder(Pictures):
         stamps: Path | None = None,
         unit: str = "s",
         gamma: bool = True,
-        log_eps: float = 0.001,
+        response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
     ):
         if not path.is_dir():
             raise RecordingError(f"{path} is no folder, but one with pictures was expected.")
@@ -168,8 +176,8 @@ class ImageFolder(Pictures):
                     f"{stamps} holds {len(times):,} times, but {path} {len(files):,} pictures; give one time a picture."
                 )
         else:
-            raise RecordingError(f"{path} needs either --frames-per-second or --stamps, the times of its pictures.")
-        super().__init__(path, times - times[0], gamma, log_eps)
+            raise FlagError(f"{path} needs either --frames-per-second or --stamps, the times of its pictures.")
+        super().__init__(path, times - times[0], gamma, response)
         self.width, self.height = image_size(self.filenames[0])
         for file in self.filenames:
             if (size := image_size(file)) != (self.width, self.height):
@@ -214,13 +222,19 @@ class Video(Pictures):
         path: The file, in any format that OpenCV decodes.
         frames_per_second: How fast the frames were recorded; None: as fast as they are played.
         gamma: As of `Pictures`.
-        log_eps: As of `Pictures`.
+        response: As of `Pictures`.
 
     Raises:
         RecordingError: No file, no video, fewer than two frames, no frame rate, or an end that is missing.
     """
 
-    def __init__(self, path: Path, frames_per_second: float | None = None, gamma: bool = True, log_eps: float = 0.001):
+    def __init__(
+        self,
+        path: Path,
+        frames_per_second: float | None = None,
+        gamma: bool = True,
+        response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
+    ):
         if not path.is_file():
             raise RecordingError(f"{path} is no file, but a video was expected.")
         self.path, self._lock = path, Lock()
@@ -237,7 +251,7 @@ class Video(Pictures):
                 f"{path} should hold {max(2, stated):,} frames{' or more' * (stated < 2)}, but only {count:,} can be "
                 "decoded; copy it again from its source."
             )
-        super().__init__(path, _regular_times(path, count, rate), gamma, log_eps)
+        super().__init__(path, _regular_times(path, count, rate), gamma, response)
         self._open()
 
     def _open(self) -> None:

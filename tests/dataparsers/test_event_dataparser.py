@@ -28,8 +28,8 @@ from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.event_dataset import EventDataset
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+from enerf_ns.event_dataset import EventDataset
 from enerf_ns.poses.posed_camera import PosedCamera
 
 NEAR, FAR = 0.5, 4.0

@@ -29,7 +29,8 @@ from enerf_ns.dataparsers.inspection import Inspection
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 VOID = {"meta", "img", "br"}
 
@@ -277,5 +278,5 @@ def test_simulated_recordings_have_no_problems(
     tmp_path: Path, scene: Literal["shapes", "carpet"], motion: Literal["shake", "spiral"]
 ):
     folder = tmp_path / "recording"
-    Simulate(folder, scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60).main()
+    simulate(SimulationSettings(scene, motion=motion, duration=0.6, num_frames=24, width=80, height=60), folder)
     assert find_problems(read_recording(folder)) == []

@@ -7,7 +7,8 @@ import pytest
 from small_runs import SMALL
 
 from enerf_ns.evaluation.runs import Run, method_config, train
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +21,7 @@ def no_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tenth of a second of a small camera, with frames and depth."""
     folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate(folder, "shapes", width=32, height=24, duration=0.1, num_frames=11).main()
+    simulate(SimulationSettings("shapes", width=32, height=24, duration=0.1, num_frames=11), folder)
     return folder
 
 

@@ -34,7 +34,8 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 
 pytestmark = pytest.mark.slow
 
@@ -77,8 +78,10 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the recordings and the runs lie: `recording`, and the same `without_frames`."""
     home = tmp_path_factory.mktemp("home")
-    Simulate(home / "recording", "shapes", width=WIDTH, height=HEIGHT, duration=0.1, exposure_ms=5.0,
-             num_frames=NUM_FRAMES).main()  # fmt: skip
+    simulate(
+        SimulationSettings("shapes", width=WIDTH, height=HEIGHT, duration=0.1, exposure_ms=5.0, num_frames=NUM_FRAMES),
+        home / "recording",
+    )
     without = shutil.ignore_patterns("images*", "depth")
     shutil.copytree(home / "recording", home / "without_frames", ignore=without)
     return home
@@ -180,7 +183,9 @@ def test_convert_and_inspect(call, home: Path):
 
 def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pytest.CaptureFixture[str]):
     """Of a sequence with as many frames as the preset selects."""
-    Simulate(Path("carpet"), "carpet", width=16, height=12, duration=0.5, exposure_ms=5.0, num_frames=42).main()
+    simulate(
+        SimulationSettings("carpet", width=16, height=12, duration=0.5, exposure_ms=5.0, num_frames=42), Path("carpet")
+    )
     call("ns-train", "enerf", "--preset", "shakeCarpet1", "--data", "carpet", *SMALL)
     shown = " ".join(capsys.readouterr().out.split())
     assert "21 train and 20 held-out frames" in shown

@@ -52,6 +52,19 @@ def test_inverse_linlog_undoes_linlog():
     assert inverse_linlog(torch.tensor(math.log(100.0))).item() == pytest.approx(100 / 255)
 
 
+@pytest.mark.parametrize("name", ["linlog", "logarithm:0.001", "logarithm:0.2"])
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-14), (np.float32, 1e-6)])
+def test_responses_of_arrays_are_those_of_tensors(name: str, dtype: type, rtol: float):
+    response = response_named(name)
+    brightness = np.append(np.linspace(0.0, 1.2, 1201), [KNEE, 1e6]).astype(dtype)
+    levels = response(brightness)
+    back = response.inverse(levels)
+    assert isinstance(levels, np.ndarray) and levels.dtype == back.dtype == dtype
+    np.testing.assert_allclose(levels, response(torch.from_numpy(brightness)).numpy(), rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(back, response.inverse(torch.from_numpy(levels)).numpy(), rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(back, brightness, rtol=10 * rtol, atol=rtol)
+
+
 def test_luma_is_the_grey_of_opencv():
     rgb = np.random.default_rng(0).random((4, 5, 3), dtype=np.float32)
     np.testing.assert_allclose(luma(torch.from_numpy(rgb)), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), atol=1e-5)

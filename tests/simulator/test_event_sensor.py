@@ -6,19 +6,21 @@ import itertools
 import math
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from recordings import joined
 from scipy.optimize import brentq
 from scipy.stats import kstest
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording import Events
+from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.event_sensor import (
     CUT_JITTER,
     READOUT_QUEUE,
@@ -26,6 +28,7 @@ from enerf_ns.simulator.event_sensor import (
     EventSensor,
     PartialPicture,
     SensorSettings,
+    _brightness,
 )
 
 EPS = 0.001
@@ -109,13 +112,36 @@ def test_pictures_in_single_precision_are_taken_as_they_are():
 
 @pytest.mark.parametrize("brightest", [1.0, 1e6])
 def test_from_black_to_white_and_back_counts_in_logarithms(brightest):
-    settings = SensorSettings(contrast_thresholds=(0.11, 0.17), log_eps=0.02)
+    settings = SensorSettings(contrast_thresholds=(0.11, 0.17), response="logarithm:0.02")
     sensor = EventSensor(settings, np.zeros((1, 2), np.float32), 0)
     up = sensor.advance(np.array([[brightest, 0]], np.float32), 1000)
     down = sensor.advance(np.zeros((1, 2), np.float32), 2000)
     height = math.log((brightest + 0.02) / 0.02)
     assert len(up) == math.floor(height / 0.11) and (up.p == 1).all() and (up.x == 0).all()
     assert len(down) == math.floor(len(up) * 0.11 / 0.17) and (down.p == -1).all()
+
+
+@pytest.mark.parametrize(("response", "offset"), [("linlog", math.nan), ("logarithm:0.001", 0.001)])
+def test_the_compiled_inverse_is_that_of_the_response(response, offset):
+    levels = response_named(response)(np.append(np.linspace(0, 1.2, 500), [20 / 255, 1e6]))
+    found = np.array([_brightness(level, offset) for level in levels.tolist()])
+    expected = response_named(response).inverse(torch.from_numpy(levels)).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.05])
+def test_events_of_linlog_add_up_to_its_differences(threshold):
+    """Of 255 b: b ln(20) / 20 in the dark and ln(b) above 20, to a threshold; at the times of the crossings."""
+    grey = np.array([0.0, 3.0, 19.9, 20.0, 40.0, 200.0])
+    log_brightness = np.array([*(math.log(20) / 20 * grey[:3]), *np.log(grey[3:])])
+    settings = SensorSettings(contrast_thresholds=(threshold, threshold), response="linlog")
+    for first, second in itertools.product(range(len(grey)), repeat=2):
+        sensor = EventSensor(settings, grey[first].reshape(1, 1) / 255, 0)
+        events = sensor.advance(grey[second].reshape(1, 1) / 255, SECOND)
+        change = log_brightness[second] - log_brightness[first]
+        assert abs(change - threshold * events.p.sum(dtype=int)) < threshold and (events.p == np.sign(change)).all()
+        n = np.arange(1, len(events) + 1)
+        np.testing.assert_allclose(events.t, n * threshold / max(abs(change), 1e-9) * SECOND, rtol=0, atol=1)
 
 
 def test_ten_thousand_seconds_of_flicker_add_up_no_errors():
@@ -352,7 +378,7 @@ def test_every_pixel_counts_by_its_own_threshold():
 
 def test_a_spread_that_leaves_pixels_without_a_threshold_is_refused():
     settings = SensorSettings(threshold_spread=0.5, seed=7)
-    with pytest.raises(RecordingError, match=r"^threshold_spread is 0.5, which leaves (\d+) of 1200 pixels") as caught:
+    with pytest.raises(FlagError, match=r"^threshold_spread is 0.5, which leaves (\d+) of 1200 pixels") as caught:
         EventSensor(settings, np.ones((30, 40)), 0)
     share = int(str(caught.value).split("leaves ")[1].split(" ")[0]) / 1200
     assert share == pytest.approx(1 - (1 - 0.02275) ** 2, rel=0.4)  # beyond two standard deviations, on or off
@@ -474,11 +500,13 @@ def test_what_is_off_draws_nothing():
     assert 0.89 < same.mean() < 0.92
 
 
-def test_everything_together_is_what_a_slow_loop_finds():
+@pytest.mark.parametrize("response", ["logarithm:0.001", "linlog"])
+def test_everything_together_is_what_a_slow_loop_finds(response):
+    settings = SensorSettings(**EVERYTHING, response=response)
     shape = (3, 5)
     times = np.cumsum([7 * MS, *np.random.default_rng(8).integers(300_000, 1_500_000, 40)])
     pictures = np.exp(wander(shape, len(times), size=0.25, seed=9)) - EPS
-    sensor = EventSensor(SensorSettings(**EVERYTHING), pictures[0], int(times[0]))
+    sensor = EventSensor(settings, pictures[0], int(times[0]))
     pieces = [sensor.advance(picture, int(time)) for picture, time in zip(pictures[1:], times[1:], strict=True)]
     events = joined([*pieces, sensor.finish()])
     for piece, time in zip(pieces, times[1:], strict=True):
@@ -490,7 +518,7 @@ def test_everything_together_is_what_a_slow_loop_finds():
         thresholds = sensor.contrast_thresholds[:, y, x].tolist()
         pixel = y * shape[1] + x
         hot = pixel in sensor.hot_pixels.tolist()
-        arrivals += loop(SensorSettings(**EVERYTHING), thresholds, hot, pixel, pictures[:, y, x], times)
+        arrivals += loop(settings, thresholds, hot, pixel, pictures[:, y, x], times)
     arrivals.sort()
     kept, departures = carried(np.array([time for time, *_ in arrivals]), EVERYTHING["readout_rate"])
     rows = [(time, *arrivals[i][1:]) for i, time in zip(kept, departures, strict=True) if time <= times[-1]]
@@ -619,6 +647,17 @@ def split_mix(key: int, pixel: int, number: int) -> int:
     return bits ^ bits >> 31
 
 
+def written_out(response: str) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[float], float]]:
+    """Log brightness of brightness, and brightness of log brightness."""
+    if response != "linlog":
+        return lambda b: np.log(b + EPS), lambda level: math.exp(level) - EPS
+    slope = math.log(20) / 20
+    return (
+        lambda b: np.where(255 * b < 20, 255 * b * slope, np.log(np.maximum(255 * b, 20))),
+        lambda level: (level / slope if level < math.log(20) else math.exp(level)) / 255,
+    )
+
+
 def loop(
     settings: SensorSettings,
     thresholds: Sequence[float],
@@ -633,7 +672,8 @@ def loop(
     )
     start, end = int(times[0]), int(times[-1])
     rate = 1e-9 * (settings.hot_pixel_rate if hot else settings.shot_noise_rate)
-    log_brightness = np.log(brightness + settings.log_eps)
+    logarithm, inverse = written_out(settings.response)
+    log_brightness = logarithm(brightness)
 
     def uniform(key: int, number: int) -> float:
         return ((split_mix(key, pixel, number) >> 11) + 1) / 2**53
@@ -648,7 +688,7 @@ def loop(
         k = min(max(int(np.searchsorted(times, time)) - 1, 0), len(times) - 2)
         seconds, length = (time - times[k]) * 1e-9, (times[k + 1] - times[k]) * 1e-9
         slope = (log_brightness[k + 1] - log_brightness[k]) / length
-        middle = math.exp((log_brightness[k] + log_brightness[k + 1]) / 2) - settings.log_eps
+        middle = inverse((log_brightness[k] + log_brightness[k + 1]) / 2)
         relative = (255 * middle + 20) / 275
         tau = 1 / (2 * math.pi * settings.cutoff_frequency * relative)
         settled = log_brightness[k] + slope * (seconds - tau)
@@ -683,7 +723,7 @@ def loop(
         elif noise > end:
             break
         else:
-            here = math.exp(np.interp(noise, times, log_brightness)) - settings.log_eps
+            here = inverse(float(np.interp(noise, times, log_brightness)))
             chance = 1.0 if hot else 1 - 0.75 * min(here, 1.0)
             fires = awake <= noise and uniform(noise_key, number) <= chance
             if fires:
@@ -716,6 +756,7 @@ def loop(
         dict(refractory_period=-1),
         dict(refractory_period=10**30),
         dict(leak_rate=-0.1),
+        dict(leak_rate=-1.0),
         dict(leak_rate=math.nan),
         dict(shot_noise_rate=-1.0),
         dict(shot_noise_rate=math.inf),
@@ -725,14 +766,19 @@ def loop(
         dict(cutoff_frequency=-1.0),
         dict(timestamp_jitter=-1.0),
         dict(readout_rate=-1.0),
-        dict(log_eps=0.0),
         dict(seed=-1),
     ],
 )
 def test_settings_that_no_sensor_has_are_refused(wrong):
     (name,) = wrong
-    with pytest.raises(RecordingError, match=f"^{name} is .*, but must be .*\\.$"):
+    with pytest.raises(FlagError, match=f"^{name} is .*, but must be .*\\.$"):
         SensorSettings(**wrong)
+
+
+@pytest.mark.parametrize("wrong", ["logarithm:0.0", "logarithm", "linear", ""])
+def test_responses_that_no_sensor_has_are_refused(wrong):
+    with pytest.raises(FlagError, match=f"^--response names the response '{wrong}', but linlog, or .* expected\\.$"):
+        SensorSettings(response=wrong)
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings, develop
 
 MS = 1_000_000
@@ -107,7 +107,7 @@ def test_a_picture_that_is_left_out_is_noticed(left_out: int):
 
 @pytest.mark.parametrize("exposure", [21 * MS, -1])
 def test_exposures_longer_than_the_frame_interval_are_refused(exposure: int):
-    with pytest.raises(RecordingError, match=rf"exposure of {exposure * 1e-6:g} ms does not fit frames 20 ms apart"):
+    with pytest.raises(FlagError, match=rf"exposure of {exposure * 1e-6:g} ms does not fit frames 20 ms apart"):
         Exposures(np.array([10, 30, 60]) * MS, exposure)
     Exposures(np.array([10, 30, 60]) * MS, 20 * MS)
 
@@ -166,5 +166,5 @@ def test_noise_is_of_the_seed_the_frame_and_whether_it_is_blurred():
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict, message: str):
-    with pytest.raises(RecordingError, match=message):
+    with pytest.raises(FlagError, match=message):
         FrameSettings(**wrong)

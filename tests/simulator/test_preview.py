@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.simulator.preview import NO_COLOUR, OFF_COLOUR, ON_COLOUR, Preview
 
@@ -80,10 +80,10 @@ def test_cameras_of_two_odd_sizes_in_colour_without_blur_and_depth(tmp_path: Pat
 def test_a_folder_that_is_missing_is_named(tmp_path: Path):
     path = tmp_path / "missing" / "preview.mp4"
     message = f"{re.escape(str(path))} could not be written as a video; .*without --preview\\.$"
-    with pytest.raises(RecordingError, match=message), Preview(path, WIDTH, HEIGHT) as preview:
+    with pytest.raises(OutputError, match=message), Preview(path, WIDTH, HEIGHT) as preview:
         for _ in range(20):
             preview.add_frame(np.zeros((480, 640), np.uint8), None, None)
-    with pytest.raises(RecordingError, match=message), Preview(path, WIDTH, HEIGHT) as preview:
+    with pytest.raises(OutputError, match=message), Preview(path, WIDTH, HEIGHT) as preview:
         preview.add_frame(np.zeros((HEIGHT, WIDTH), np.uint8), None, None)
 
 

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.sampling import MAX_CHANGE, MOST_HALVINGS, Render, adaptive_renders, render_times
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -321,13 +322,14 @@ def test_few_times_and_times_next_to_each_other(times, between):
 
 
 def test_black_that_becomes_less_black_is_rendered_between_as_any_other_change():
-    """From 0 to log_eps within an interval; in its first half by ln 1.5, and in the second it still bends too much."""
+    """From 0 to the logarithm's offset within an interval; in its first half by ln 1.5, and in the second it still
+    bends too much."""
     brightness = np.array([0.0, 0.001, 0.001, 0.001])
 
     def dark(times: np.ndarray) -> np.ndarray:
         return np.repeat(np.log(EPS + np.interp(times, np.arange(4) * MS, brightness))[:, None], HEIGHT * WIDTH, axis=1)
 
-    first, *renders = adaptive_renders(Seen(dark), np.arange(4) * MS, log_eps=EPS)
+    first, *renders = adaptive_renders(Seen(dark), np.arange(4) * MS, response=Logarithm(EPS))
     assert (first.brightness < 1e-15).all()
     assert [part.time / MS for part in renders[0].before] == [0.25, 0.5, 0.75]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from functools import cache
@@ -20,12 +21,14 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.sensor.response import Logarithm
+from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.frames import Exposures, Frame
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT, adaptive_renders, render_times
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene
+from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.simulator.sources import RenderedScene, Source
 from enerf_ns.simulator.trajectories import MOTIONS
 
@@ -64,7 +67,7 @@ def times_of(source: RenderedScene, stops: np.ndarray, max_displacement: float =
 
 
 def events_of(source: Source, times: np.ndarray, settings: SensorSettings, threads: int = 2) -> Events:
-    first, *renders = adaptive_renders(source.brightness, times, log_eps=EPS, threads=threads)
+    first, *renders = adaptive_renders(source.brightness, times, response=Logarithm(EPS), threads=threads)
     sensor = EventSensor(settings, first.brightness, first.time)
     pieces = [sensor.advance(picture, time, before) for time, picture, before in renders]
     return joined([*pieces, sensor.finish()])
@@ -264,10 +267,18 @@ def test_a_ramp_from_image_to_image_of_a_folder_gives_the_times_of_its_events(tm
     levels = np.random.default_rng(0).integers(300, 65536, (2, 5, 7)).astype(np.uint16)
     for k in range(2):
         cv2.imwrite(str(tmp_path / f"images/{k}.png"), levels[k])
-    Simulate(
-        tmp_path / "recording", str(tmp_path / "images"), layout="event_recording", frames_per_second=10.0,
-        gamma=False, num_frames=4, exposure_ms=10.0, sensor=SensorSettings(contrast_thresholds=(0.11, 0.13)),
-    ).main()  # fmt: skip
+    simulate(
+        SimulationSettings(
+            str(tmp_path / "images"),
+            layout="event_recording",
+            frames_per_second=10.0,
+            gamma=False,
+            num_frames=4,
+            exposure_ms=10.0,
+            sensor=SensorSettings(contrast_thresholds=(0.11, 0.13)),
+        ),
+        tmp_path / "recording",
+    )
     x, y, t, p = (np.load(tmp_path / f"recording/events/{name}.npy") for name in "xytp")
     first, last = np.log(EPS + levels / 65535)
     total = 0
@@ -343,7 +354,10 @@ def recorded(folder: Path, seed: int, scene: str = "carpet") -> Path:
         contrast_thresholds=(0.2, 0.3), threshold_spread=0.05, shot_noise_rate=3.0, timestamp_jitter=1e5,
         refractory_period=50_000, seed=seed,
     )  # fmt: skip
-    Simulate(folder, scene, duration=0.15, num_frames=12, exposure_ms=10.0, width=24, height=18, sensor=noisy).main()
+    simulate(
+        SimulationSettings(scene, duration=0.15, num_frames=12, exposure_ms=10.0, width=24, height=18, sensor=noisy),
+        folder,
+    )
     return folder
 
 
@@ -385,7 +399,8 @@ def test_another_process_makes_the_same_events_of_the_same_seed_and_others_of_an
     one = events_written(recorded(tmp_path / "one", seed=5))
     other = tmp_path / "other"
     code = f"from test_simulation_proofs import recorded, Path; recorded(Path({str(other)!r}), seed=5)"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)
+    paths = os.pathsep.join(path for path in sys.path if path)
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": paths})
     np.testing.assert_array_equal(events_written(other), one)
     different = events_written(recorded(tmp_path / "different", seed=6))
     assert len(one) > 1000 and (len(different) != len(one) or (different != one).any())

@@ -20,10 +20,11 @@ from recordings import write_esim
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, TrainedRun, Video, linear_from_srgb
@@ -108,7 +109,7 @@ def test_numbers_in_names_count_as_numbers(tmp_path: Path):
 def test_between_two_pictures_log_brightness_is_linear(tmp_path: Path):
     folder, eps = write_pictures(tmp_path / "a", 3), 0.02
     (tmp_path / "times.txt").write_text("70.000\n70.010\n70.050\n")
-    source = ImageFolder(folder, stamps=tmp_path / "times.txt", log_eps=eps)
+    source = ImageFolder(folder, stamps=tmp_path / "times.txt", response=Logarithm(eps))
     np.testing.assert_array_equal(source.times, [0, 10_000_000, 50_000_000])
     first, second = (np.log(eps + slow_linear(picture(index))) for index in (1, 2))
     for share in (0.0, 0.25, 0.6, 1.0):
@@ -164,8 +165,6 @@ def damage(path: Path) -> None:
         (lambda folder: [file.unlink() for file in folder.iterdir()], dict(frames_per_second=1.0), "holds no pictures"),
         (lambda folder: [file.unlink() for file in list(folder.iterdir())[1:]], dict(frames_per_second=1.0),
          "holds only one picture"),
-        (lambda _: None, {}, "needs either --frames-per-second or"),
-        (lambda _: None, dict(frames_per_second=1.0, stamps=Path("times.txt")), "needs either --frames-per-second or"),
         (lambda _: None, dict(frames_per_second=0.0), "has 0 frames per second"),
         (lambda _: None, dict(frames_per_second=math.nan), "has nan frames per second"),
         (lambda _: None, dict(frames_per_second=1e10), r"has 1e\+10 frames per second"),
@@ -184,6 +183,12 @@ def test_folders_that_are_no_pictures_are_refused(tmp_path: Path, change, settin
     with pytest.raises(RecordingError, match=message) as refused:
         ImageFolder(folder, **settings)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("times", [{}, dict(frames_per_second=1.0, stamps=Path("times.txt"))])
+def test_either_a_frame_rate_or_times_are_needed(tmp_path: Path, times: dict):
+    with pytest.raises(FlagError, match=r"needs either --frames-per-second or --stamps, the times of its pictures\.$"):
+        ImageFolder(write_pictures(tmp_path / "a", 3), **times)
 
 
 def test_a_time_for_each_picture_is_needed(tmp_path: Path):

@@ -13,9 +13,12 @@ from recordings import POSE_TIMES, poses, write_esim
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.simulator.trajectories import from_file, key_frames, look_at, shake, spiral
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
+from enerf_ns.simulator.trajectories import MOTIONS, from_file, key_frames, look_at, sampled, shake, spiral
 
 KEY_FRAMES = np.array(
     [
@@ -182,3 +185,42 @@ def test_shake_turns_as_often_as_asked():
     turns = np.flatnonzero(np.sign(velocity[1:]) != np.sign(velocity[:-1])) + 1
     at_knots = np.abs(trajectory.times[turns] * 1e-9 * 5 - np.round(trajectory.times[turns] * 1e-9 * 5)) < 0.02
     assert len(turns) > 5 and at_knots.all(), "PCHIP turns nowhere but at its knots"
+
+
+def test_shake_moves_sideways_and_in_height_and_keeps_looking_at_the_target():
+    camera, target = np.array([0.0, 0, 0]), np.array([0.0, 2, 0])
+    trajectory = MOTIONS["shake"](3 * 10**9, camera, target, np.random.default_rng(0))
+    extent = np.ptp(trajectory.positions, axis=0)
+    assert (extent[[0, 2]] > 0.4).all() and (extent <= 0.6).all()
+    forward = Rotation.from_quat(trajectory.quaternions).apply([0, 0, 1])
+    assert forward[:, 1].min() > math.cos(math.radians(15))
+
+
+def test_look_at_is_upright_with_opencv_axes():
+    rotation = look_at(np.array([1.0, 2, 3]), np.array([1.0, 5, 3])).as_matrix()
+    np.testing.assert_allclose(rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+def test_poses_of_tum_vie_are_as_many_as_those_of_its_motion_capture():
+    trajectory = MOTIONS["shake"](123_456_789, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
+    found = sampled(trajectory, 120)
+    assert abs(1e9 / np.median(np.diff(found.times)) - 120) < 1 and (np.diff(found.times) > 4_000_000).all()
+    assert (found.start, found.end) == (0, 123_456_789) and (found.times[:-1] % 1000 == 0).all()
+    times = torch.from_numpy(found.times)
+    torch.testing.assert_close(found.poses(times), trajectory.poses(times), atol=1e-9, rtol=0)
+    assert sampled(found, 120) is found
+
+
+def test_the_shortest_trajectories_have_poses_enough():
+    trajectory = MOTIONS["shake"](4_000_000, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
+    assert sampled(trajectory, 120).times.tolist() == [0, 4_000_000]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_every_ray_of_every_motion_hits_something(scene, motion):
+    made = SCENES[scene](np.random.default_rng(0))
+    renderer = Renderer(made, Camera(48, 36, 41.6, 41.6, 24.0, 18.0))
+    trajectory = MOTIONS[motion](2 * 10**9, made.camera, made.target, np.random.default_rng(1))
+    poses = trajectory.poses(torch.linspace(0, 2e9, 40).long()).numpy()
+    assert min(renderer.depth(pose).min() for pose in poses) > 0.3

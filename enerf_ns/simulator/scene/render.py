@@ -175,7 +175,7 @@ def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], 
         count = directions.shape[axis]
         if count == 1:
             return np.full_like(directions, of_one)
-        return np.gradient(directions, axis=axis, edge_order=min(2, count - 1))
+        return np.gradient(directions, axis=axis, edge_order=2 if count > 2 else 1)
 
     return step(1, (1 / camera.fx, 0)), step(0, (0, 1 / camera.fy))
 

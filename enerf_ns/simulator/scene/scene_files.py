@@ -139,8 +139,10 @@ class Piece:
 
     def inside_out(self) -> Piece:
         """Its inside becomes its outside."""
-        of_corners = self.triangles, -self.normals, self.uv, self.colour
-        return Piece(*(array[:, ::-1] for array in of_corners), self.image)
+        triangles, normals, uv, colour = (
+            array[:, ::-1] for array in (self.triangles, -self.normals, self.uv, self.colour)
+        )
+        return Piece(triangles, normals, uv, colour, self.image)
 
 
 def read_mesh(path: Path, notes: list[str]) -> list[Piece]:

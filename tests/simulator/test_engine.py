@@ -16,15 +16,16 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording, writer_of
 from enerf_ns.dataparsers.formats.writer import Rig
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
-from enerf_ns.simulator.trajectories import MOTIONS, look_at, sampled
+from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.trajectories import MOTIONS, sampled
 
 WIDTH, HEIGHT = 48, 36
 SHORT: dict[str, Any] = dict(duration=0.3, num_frames=12, width=WIDTH, height=HEIGHT)
@@ -40,34 +41,10 @@ def camera_of(width: int, height: int, focal_length: float) -> Camera:
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_every_ray_of_every_motion_hits_something(scene, motion):
-    made = SCENES[scene](np.random.default_rng(0))
-    renderer = Renderer(made, camera_of(WIDTH, HEIGHT, WIDTH / 2 / math.tan(math.radians(30))))
-    trajectory = MOTIONS[motion](2 * 10**9, made.camera, made.target, np.random.default_rng(1))
-    poses = trajectory.poses(torch.linspace(0, 2e9, 40).long()).numpy()
-    assert min(renderer.depth(pose).min() for pose in poses) > 0.3
-
-
-def test_shake_moves_sideways_and_in_height_and_keeps_looking_at_the_target():
-    camera, target = np.array([0.0, 0, 0]), np.array([0.0, 2, 0])
-    trajectory = MOTIONS["shake"](3 * 10**9, camera, target, np.random.default_rng(0))
-    extent = np.ptp(trajectory.positions, axis=0)
-    assert (extent[[0, 2]] > 0.4).all() and (extent <= 0.6).all()
-    forward = Rotation.from_quat(trajectory.quaternions).apply([0, 0, 1])
-    assert forward[:, 1].min() > math.cos(math.radians(15))
-
-
-def test_look_at_is_upright_with_opencv_axes():
-    rotation = look_at(np.array([1.0, 2, 3]), np.array([1.0, 5, 3])).as_matrix()
-    np.testing.assert_allclose(rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("simulated") / "recording"
-    Simulate(scene="shapes", output_dir=folder, sensor=SensorSettings(contrast_thresholds=(0.2, 0.3)), **SHORT).main()
+    simulate(SimulationSettings(scene="shapes", sensor=SensorSettings(contrast_thresholds=(0.2, 0.3)), **SHORT), folder)
     return folder
 
 
@@ -102,7 +79,7 @@ def test_sharp_frames_and_depth_are_seen_from_the_written_trajectory(recording, 
 
 def test_blurred_frames_are_the_mean_of_sharp_ones_over_the_exposure(tmp_path, renderer):
     folder = tmp_path / "fine"
-    Simulate(scene="shapes", output_dir=folder, max_displacement=0.1, **SHORT).main()
+    simulate(SimulationSettings(scene="shapes", max_displacement=0.1, **SHORT), folder)
     for k in (0, 5, 11):
         times = stamps(folder)[k] + 20e6 * ((np.arange(200) + 0.5) / 200 - 0.5)
         mean = np.mean([renderer.brightness(pose) for pose in written_poses(folder, times)], axis=0)
@@ -158,7 +135,7 @@ def test_the_same_seed_writes_the_same_files_and_another_seed_others(tmp_path):
         scene="carpet", motion="spiral", duration=0.2, num_frames=11, exposure_ms=10, width=32, height=24
     )
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        Simulate(output_dir=tmp_path / name, sensor=SensorSettings(seed=seed), **settings).main()
+        simulate(SimulationSettings(sensor=SensorSettings(seed=seed), **settings), tmp_path / name)
     files = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*")]
     assert len(files) == 3 + 2 * 12 + 2 * 11
     for file in files:
@@ -169,53 +146,55 @@ def test_the_same_seed_writes_the_same_files_and_another_seed_others(tmp_path):
 def test_an_existing_recording_is_not_overwritten(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(RecordingError, match="mine exists already"):
-        Simulate(scene="shapes", output_dir=tmp_path / "mine", **SHORT).main()
+    with pytest.raises(OutputError, match="mine exists already"):
+        simulate(SimulationSettings(scene="shapes", **SHORT), tmp_path / "mine")
     assert [path.name for path in tmp_path.rglob("*")] == ["mine", "notes.txt"]
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("error", "wrong", "sentence"),
     [
-        (dict(duration=0.0), "--duration is 0.0, but must be"),
-        (dict(num_frames=10), "The layout esim needs at least 11 frames"),
-        (dict(exposure_ms=30.0), "The exposure of 30 ms does not fit frames 25 ms apart"),
-        (dict(field_of_view=180.0), "--field-of-view is 180.0, but must be"),
-        (dict(max_displacement=0.0), "--max-displacement is 0.0, but must be"),
-        (dict(width=0), "--width is 0, but must be"),
-        (dict(bayer_pattern="RGB"), "--bayer-pattern is RGB, but must be"),
-        (dict(scene="nowhere"), "nowhere is neither a preset"),
-        (dict(scene=None), "Give either what is to be seen"),
-        (dict(from_run=Path("config.yml")), "Give either what is to be seen"),
-        (dict(layout="tum_vie"), "1280 x 720"),
-        (dict(cameras=Path("nowhere.json"), width=None, height=None), "nowhere.json is missing"),
-        (dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),
-        (dict(width=30000, height=30000), "30000 x 30000 pixels is too large"),
-        (dict(num_frames=10**9, exposure_ms=0.0), "0.3 s have no room for 1000000000 frames"),
-        (dict(duration=1e-4), "--duration is 0.0001, but must be"),
-        (dict(output_dir=Path("/dev/null/new")), "/dev/null/new cannot be made a folder"),
-        (dict(layout="eds"), "--width changes nothing in the layout eds without --cameras"),
-        (dict(cameras=Path("nowhere.json")), "--width changes nothing beside --cameras"),
-        (dict(motion="shake", key_frames=Path("keys.txt")), "--motion changes nothing beside --key-frames"),
-        (dict(trajectory=Path("a"), key_frames=Path("b")), "--trajectory changes nothing beside --key-frames"),
-        (dict(motion="spiral", trajectory=Path("a")), "--motion changes nothing beside --trajectory"),
-        (dict(trajectory_unit="us"), "--trajectory-unit changes nothing unless --trajectory is a text file"),
-        (dict(stamps=Path("a")), "--stamps changes nothing without a folder of images or a video"),
-        (dict(gamma=False), "--no-gamma changes nothing without a folder of images or a video"),
-        (dict(scene="a.mp4", layout="event_recording"), "--width changes nothing for pictures"),
-        (dict(scene=None, from_run=Path("a"), motion="shake"), "--motion changes nothing for a trained run"),
+        (FlagError, dict(duration=0.0), "--duration is 0.0, but must be"),
+        (FlagError, dict(num_frames=10), "The layout esim needs at least 11 frames"),
+        (FlagError, dict(exposure_ms=30.0), "The exposure of 30 ms does not fit frames 25 ms apart"),
+        (FlagError, dict(field_of_view=180.0), "--field-of-view is 180.0, but must be"),
+        (FlagError, dict(max_displacement=0.0), "--max-displacement is 0.0, but must be"),
+        (FlagError, dict(width=0), "--width is 0, but must be"),
+        (FlagError, dict(bayer_pattern="RGB"), "--bayer-pattern is RGB, but must be"),
+        (RecordingError, dict(scene="nowhere"), "nowhere is neither a preset"),
+        (FlagError, dict(scene=None), "Give either what is to be seen"),
+        (FlagError, dict(from_run=Path("config.yml")), "Give either what is to be seen"),
+        (FlagError, dict(layout="tum_vie"), "1280 x 720"),
+        (RecordingError, dict(cameras=Path("nowhere.json"), width=None, height=None), "nowhere.json is missing"),
+        (RecordingError, dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),
+        (FlagError, dict(width=30000, height=30000), "30000 x 30000 pixels is too large"),
+        (FlagError, dict(num_frames=10**9, exposure_ms=0.0), "0.3 s have no room for 1000000000 frames"),
+        (FlagError, dict(duration=1e-4), "--duration is 0.0001, but must be"),
+        (FlagError, dict(layout="eds"), "--width changes nothing in the layout eds without --cameras"),
+        (FlagError, dict(cameras=Path("nowhere.json")), "--width changes nothing beside --cameras"),
+        (FlagError, dict(motion="shake", key_frames=Path("keys.txt")), "--motion changes nothing beside --key-frames"),
+        (
+            FlagError,
+            dict(trajectory=Path("a"), key_frames=Path("b")),
+            "--trajectory changes nothing beside --key-frames",
+        ),
+        (FlagError, dict(motion="spiral", trajectory=Path("a")), "--motion changes nothing beside --trajectory"),
+        (FlagError, dict(trajectory_unit="us"), "--trajectory-unit changes nothing unless --trajectory is a text file"),
+        (FlagError, dict(stamps=Path("a")), "--stamps changes nothing without a folder of images or a video"),
+        (FlagError, dict(gamma=False), "--no-gamma changes nothing without a folder of images or a video"),
+        (FlagError, dict(scene="a.mp4", layout="event_recording"), "--width changes nothing for pictures"),
+        (FlagError, dict(scene=None, from_run=Path("a"), motion="shake"), "--motion changes nothing for a trained run"),
     ],
 )
-def test_settings_that_make_no_recording_are_refused(tmp_path, wrong, sentence):
-    with pytest.raises(UserError, match=sentence):
-        Simulate(**{"scene": "shapes", "output_dir": tmp_path / "new", **SHORT, **wrong}).main()
+def test_settings_that_make_no_recording_are_refused(tmp_path, error, wrong, sentence):
+    with pytest.raises(error, match=sentence):
+        simulate(SimulationSettings(**{"scene": "shapes", **SHORT, **wrong}), tmp_path / "new")
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("wrong", [dict(contrast_thresholds=(0.25, 0.0)), dict(log_eps=0.0), dict(leak_rate=-1.0)])
-def test_sensors_that_cannot_be_are_refused(wrong):
-    with pytest.raises(RecordingError, match=f"^{next(iter(wrong))} is .* but must be"):
-        SensorSettings(**wrong)
+def test_a_place_where_nothing_can_be_written_is_refused():
+    with pytest.raises(OutputError, match=r"^/dev/null/new cannot be made a folder \(.*\); give another"):
+        simulate(SimulationSettings("shapes", **SHORT), Path("/dev/null/new"))
 
 
 def test_every_layout_is_written_and_read_back(tmp_path):
@@ -228,10 +207,20 @@ def test_every_layout_is_written_and_read_back(tmp_path):
         json.dumps({"camera": {**camera, "distortion": [-0.1, 0.05, 0.0, 0.0]}, "frame_camera": frame_camera})
     )
     sensor = SensorSettings(refractory_period=100_000, threshold_spread=0.03)
-    Simulate(
-        tmp_path / "own", "roads", layout="event_recording", cameras=tmp_path / "cameras.json", sensor=sensor,
-        color=True, duration=0.2, num_frames=6, exposure_ms=10.0, preview=True,
-    ).main()  # fmt: skip
+    simulate(
+        SimulationSettings(
+            "roads",
+            layout="event_recording",
+            cameras=tmp_path / "cameras.json",
+            sensor=sensor,
+            colour=True,
+            duration=0.2,
+            num_frames=6,
+            exposure_ms=10.0,
+        ),
+        tmp_path / "own",
+        preview=True,
+    )
     read = read_recording(tmp_path / "own")
     assert read.refractory_period == 100_000 and read.contrast_thresholds == (0.25, 0.25)
     assert read.frames is not None and read.blurred_frames is not None and len(read.frames.times) == 6
@@ -253,47 +242,38 @@ def test_a_video_of_pictures_makes_events(tmp_path):
     for k in range(5):
         picture = np.full((12, 16), 40 * (k + 1), np.uint8)
         cv2.imwrite(str(tmp_path / f"pictures/{k}.png"), picture)
-    Simulate(
-        tmp_path / "own", str(tmp_path / "pictures"), layout="event_recording", frames_per_second=10.0, gamma=False,
-        num_frames=3, exposure_ms=10.0,
-    ).main()  # fmt: skip
+    simulate(
+        SimulationSettings(
+            str(tmp_path / "pictures"),
+            layout="event_recording",
+            frames_per_second=10.0,
+            gamma=False,
+            num_frames=3,
+            exposure_ms=10.0,
+        ),
+        tmp_path / "own",
+    )
     change = math.log((200 / 255 + 0.001) / (40 / 255 + 0.001))
     x, p = (np.load(tmp_path / f"own/events/{name}.npy") for name in "xp")
     assert len(x) == 12 * 16 * math.floor(change / 0.25) and (p > 0).all()
 
 
-def test_the_published_cameras_of_tum_vie_are_those_of_its_calibration(shared_data):
-    stated = json.loads((shared_data / "tum_vie/camera-calibrationA.json").read_text())["value0"]
-    event_camera, frame_camera, event_from_frame = published_rig("tum_vie")
-    poses = []
-    for index, camera in ((2, event_camera), (0, frame_camera)):
-        lens = stated["intrinsics"][index]["intrinsics"]
-        assert [camera.width, camera.height] == stated["resolution"][index] and camera.model == "fisheye"
-        assert (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion) == tuple(lens.values())
-        mount, pose = stated["T_imu_cam"][index], np.eye(4)
-        pose[:3, :3] = Rotation.from_quat([mount[f"q{axis}"] for axis in "xyzw"]).as_matrix()
-        pose[:3, 3] = [mount[f"p{axis}"] for axis in "xyz"]
-        poses.append(pose)
-    np.testing.assert_allclose(poses[0] @ event_from_frame, poses[1], atol=1e-12)
-
-
-def test_poses_of_tum_vie_are_as_many_as_those_of_its_motion_capture():
-    trajectory = MOTIONS["shake"](123_456_789, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
-    found = sampled(trajectory, 120)
-    assert abs(1e9 / np.median(np.diff(found.times)) - 120) < 1 and (np.diff(found.times) > 4_000_000).all()
-    assert (found.start, found.end) == (0, 123_456_789) and (found.times[:-1] % 1000 == 0).all()
-    times = torch.from_numpy(found.times)
-    torch.testing.assert_close(found.poses(times), trajectory.poses(times), atol=1e-9, rtol=0)
-    assert sampled(found, 120) is found
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["eds", "tum_vie"])
 def test_layouts_of_data_sets_have_their_cameras_and_the_trajectory_that_was_rendered(tmp_path, layout):
-    Simulate(
-        tmp_path / "new", "carpet", layout=layout, motion="spiral", duration=0.02, num_frames=2, exposure_ms=2.0,
-        max_displacement=32.0, max_change=9.0,
-    ).main()  # fmt: skip
+    simulate(
+        SimulationSettings(
+            "carpet",
+            layout=layout,
+            motion="spiral",
+            duration=0.02,
+            num_frames=2,
+            exposure_ms=2.0,
+            max_displacement=32.0,
+            max_change=9.0,
+        ),
+        tmp_path / "new",
+    )
     read = read_recording(tmp_path / "new")
     event_camera, frame_camera, event_from_frame = published_rig(layout)
     assert read.frames is not None and (read.camera, read.frames.camera) == (event_camera, frame_camera)
@@ -321,26 +301,28 @@ def test_layouts_of_data_sets_have_their_cameras_and_the_trajectory_that_was_ren
 def test_thresholds_are_those_of_the_preset_unless_given(tmp_path):
     for given, expected in ((None, (0.2, 0.2)), ((0.3, 0.4), (0.3, 0.4))):
         folder = tmp_path / str(given)
-        Simulate(
-            folder, "spiral1", duration=0.1, num_frames=11, exposure_ms=2.0, width=32, height=24,
-            contrast_thresholds=given,
-        ).main()  # fmt: skip
+        simulate(
+            SimulationSettings(
+                "spiral1", duration=0.1, num_frames=11, exposure_ms=2.0, width=32, height=24, contrast_thresholds=given
+            ),
+            folder,
+        )
         assert read_recording(folder).contrast_thresholds == expected
 
 
 def test_frames_in_colour_leave_the_events_as_they_are(tmp_path):
     """But for those at pixels that are rendered once more since one of their colours changes more than their mean."""
     counts = []
-    for color in (False, True):
-        Simulate(tmp_path / str(color), "roads", color=color, **SHORT).main()
-        counts.append(len(index_events(read_recording(tmp_path / str(color)))))
+    for colour in (False, True):
+        simulate(SimulationSettings("roads", colour=colour, **SHORT), tmp_path / str(colour))
+        counts.append(len(index_events(read_recording(tmp_path / str(colour)))))
     assert counts[0] == pytest.approx(counts[1], rel=0.01)
 
 
 @pytest.mark.parametrize(("duration", "num_frames"), [(0.3, 12), (2.3, 94)])
 def test_frames_are_as_dense_whatever_the_duration(tmp_path, duration, num_frames):
     """Also where the times of rendering are found in several pieces."""
-    Simulate(tmp_path / "new", "carpet", motion="spiral", duration=duration, width=16, height=12).main()
+    simulate(SimulationSettings("carpet", motion="spiral", duration=duration, width=16, height=12), tmp_path / "new")
     read = read_recording(tmp_path / "new")
     assert read.frames is not None and len(read.frames.times) == num_frames
     assert read.trajectory.end == round(duration * 1e9)
@@ -353,22 +335,20 @@ def test_pictures_need_no_layout(tmp_path):
     for number in range(30):
         picture = np.full((12, 16), 60 + 60 * (number % 3), np.uint8)
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
-    Simulate(tmp_path / "new", str(tmp_path), frames_per_second=30).main()
+    simulate(SimulationSettings(str(tmp_path), frames_per_second=30), tmp_path / "new")
     assert (tmp_path / "new/recording.json").exists()
 
 
 def test_a_colour_filter_needs_colours_and_a_layout_for_it(tmp_path):
-    with pytest.raises(RecordingError, match=r"^--layout esim has no place for a --bayer-pattern; give"):
-        Simulate(tmp_path / "new", "roads", bayer_pattern="RGGB", layout="esim", **SHORT).main()
-    with pytest.raises(RecordingError, match=r"^--bayer-pattern needs colours, but carpet is grey\.$"):
-        Simulate(tmp_path / "new", "carpet", bayer_pattern="RGGB", **SHORT).main()
-    Simulate(tmp_path / "new", "roads", bayer_pattern="RGGB", **SHORT).main()
+    with pytest.raises(FlagError, match=r"^--layout esim has no place for a --bayer-pattern; give"):
+        simulate(SimulationSettings("roads", bayer_pattern="RGGB", layout="esim", **SHORT), tmp_path / "new")
+    with pytest.raises(FlagError, match=r"^--bayer-pattern needs colours, but carpet is grey\.$"):
+        simulate(SimulationSettings("carpet", bayer_pattern="RGGB", **SHORT), tmp_path / "new")
+    simulate(SimulationSettings("roads", bayer_pattern="RGGB", **SHORT), tmp_path / "new")
     assert read_recording(tmp_path / "new").bayer_pattern == "RGGB"
 
 
-def test_the_shortest_recordings_have_frames_and_poses_enough(tmp_path):
-    trajectory = MOTIONS["shake"](4_000_000, np.zeros(3), np.array([0.0, 2, 0]), np.random.default_rng(0))
-    assert sampled(trajectory, 120).times.tolist() == [0, 4_000_000]
-    Simulate(tmp_path / "new", "carpet", duration=0.1, width=16, height=12).main()
+def test_the_shortest_recordings_have_frames_enough(tmp_path):
+    simulate(SimulationSettings("carpet", duration=0.1, width=16, height=12), tmp_path / "new")
     read = read_recording(tmp_path / "new")
     assert read.frames is not None and len(read.frames.times) == 11

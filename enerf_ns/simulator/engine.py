@@ -1,0 +1,283 @@
+"""Simulates a recording: events, frames, depth and poses of what is looked at, written as they come."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from enerf_ns.dataparsers.errors import FlagError, OutputError
+from enerf_ns.dataparsers.formats.registry import open_writer, writer_of
+from enerf_ns.dataparsers.formats.writer import Setup, Writer
+from enerf_ns.dataparsers.recording import Events
+from enerf_ns.sensor.response import ColourFilter, luma, pixel_brightness, response_named
+from enerf_ns.simulator.event_sensor import EventSensor
+from enerf_ns.simulator.frames import Exposures, Frame, develop
+from enerf_ns.simulator.preview import Preview
+from enerf_ns.simulator.sampling import Render, adaptive_renders, render_times
+from enerf_ns.simulator.settings import SimulationSettings, resolve
+from enerf_ns.simulator.sources import Pictures, RenderedScene, Source, TrainedRun
+from enerf_ns.simulator.view import View, view_of
+
+FRAME_RATE, EXPOSURE_MS = 41.0, 20.0
+"""Frames per second, and the exposure of blurred ones, where neither a preset nor a setting states them."""
+
+WINDOW = 10**9
+"""Nanoseconds for which it is found out at once when to render."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What was simulated."""
+
+    folder: Path
+    """Of the recording."""
+    duration: int
+    """ns"""
+    num_events: int
+    num_frames: int
+    has_poses: bool
+    """False for pictures, on which nothing can be trained."""
+    notes: tuple[str, ...]
+    """What the user should know, one sentence each."""
+
+
+def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = False) -> Simulation:
+    """Simulates a recording and writes it; shows a progress bar meanwhile.
+
+    Args:
+        settings: What is simulated, and how.
+        output_dir: Folder that is new or empty.
+        preview: Write preview.mp4 too: frame, blurred frame, events and depth side by side.
+
+    Raises:
+        FlagError: A setting is out of its range, contradicts another, or changes nothing.
+        RecordingError: An input cannot be read or used.
+        OutputError: The folder is not empty or cannot be made, or the preview cannot be written.
+    """
+    output_dir = output_dir.expanduser().resolve()
+    if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
+        raise OutputError(
+            f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
+        )
+    settings, notes = resolve(settings), []
+    assert settings.layout is not None
+    view = view_of(settings, notes)
+    exposures = _exposures(settings, view)
+    first = view.events.brightness(view.start)
+    if first.ndim == 2:
+        seen = settings.scene or settings.from_run
+        if settings.bayer_pattern:
+            raise FlagError(f"--bayer-pattern needs colours, but {seen} is grey.")
+        if settings.colour:
+            notes.append(f"--colour changes nothing, since {seen} is grey.")
+    camera = _EventCamera(settings, first, view.start)
+    setup = _setup(settings, view, exposures, camera.sensor)
+    is_new = not output_dir.exists()
+    try:
+        output_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{output_dir} cannot be made a folder ({error.strerror}); give another --output-dir."
+        ) from error
+    with ExitStack() as stack:
+        if is_new:
+            stack.callback(_remove_if_empty, output_dir)
+        writer = stack.enter_context(open_writer(settings.layout, output_dir, setup))
+        video = None
+        if preview:
+            video = stack.enter_context(Preview(output_dir / "preview.mp4", view.events.width, view.events.height))
+        _record(settings, view, exposures, camera, _Recorder(settings, writer, video))
+    if not writer.num_events:
+        notes.append("There are no events, without which a recording cannot be read; let more change.")
+    return Simulation(
+        folder=output_dir,
+        duration=view.end - view.start,
+        num_events=writer.num_events,
+        num_frames=writer.num_frames,
+        has_poses=view.trajectory is not None,
+        notes=(*notes, *writer.notes),
+    )
+
+
+def _exposures(settings: SimulationSettings, view: View) -> Exposures:
+    """Of frames that are evenly spread, in whole microseconds."""
+    preset, length = settings.preset, view.end - view.start
+    rate = preset.num_frames / preset.duration if preset else FRAME_RATE
+    assert settings.layout is not None
+    fewest = writer_of(settings.layout).fewest_frames
+    count = settings.num_frames or max(fewest, round(rate * length * 1e-9))
+    exposure_ms = settings.exposure_ms
+    if exposure_ms is None:
+        longest = max(0, length // count // 2000 - 1) * 2e-3
+        exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, longest)
+    exposure = round(exposure_ms * 500) * 2000
+    if count * 1000 > length or (count == 1 and exposure > length):
+        raise FlagError(
+            f"{length * 1e-9:g} s have no room for {count} frame{'s' * (count > 1)} with exposures of "
+            f"{exposure * 1e-6:g} ms, since frames are at least 1 us apart; give less or a longer --duration."
+        )
+    times = view.start + ((np.arange(count) + 0.5) * length / count).astype(np.int64) // 1000 * 1000
+    return Exposures(times, exposure)
+
+
+class _EventCamera:
+    """The event sensor behind its colour filter, if it has one.
+
+    Args:
+        settings: Of the simulation.
+        brightness: [height, width] or, in colour, [height, width, 3]: what the sensor sees first.
+        time: At which it sees that, ns.
+    """
+
+    def __init__(self, settings: SimulationSettings, brightness: np.ndarray, time: int):
+        self._channels = None
+        if settings.bayer_pattern is not None:
+            height, width = brightness.shape[:2]
+            self._channels = ColourFilter(settings.bayer_pattern, width).channels(torch.arange(width * height))
+        self.sensor = EventSensor(settings.sensor, self._seen(brightness), time)
+
+    def advance(self, render: Render) -> Events:
+        """Events from the last picture to this one."""
+        before = [part._replace(brightness=self._seen(part.brightness, part.pixels)) for part in render.before]
+        return self.sensor.advance(self._seen(render.brightness), render.time, before)
+
+    def _seen(self, brightness: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:
+        """What all pixels [height, width], or these [pixels], see of a grey or coloured brightness."""
+        shape = brightness.shape[: 2 if pixels is None else 1]
+        if brightness.ndim == len(shape):
+            return brightness
+        channels = self._channels
+        if channels is not None:
+            channels = channels.view(shape) if pixels is None else channels[pixels]
+        return pixel_brightness(torch.from_numpy(brightness), channels).numpy()
+
+
+def _record(
+    settings: SimulationSettings, view: View, exposures: Exposures, camera: _EventCamera, recorder: _Recorder
+) -> None:
+    """Renders from the first time to the last, and records what the cameras make of it."""
+    stops = np.array([view.start, view.end])
+    others: Iterator[Frame] = iter(())
+    if view.frames is None:
+        stops = np.union1d(stops, exposures.stops)
+    else:
+        others = _frames(settings, view.frames, exposures)
+    following = next(others, None)
+    columns = (TextColumn("Simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(width=120), transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+        for render in _renders(settings, view.events, stops, settings.max_change):
+            if render.time > view.start:
+                recorder.add_events(camera.advance(render))
+            if view.frames is None:
+                frame = exposures.add(render.time, _shown(settings, render.brightness))
+                if frame is not None:
+                    recorder.add_frame(frame, view.events)
+            while following is not None and following.time <= render.time:
+                assert view.frames is not None
+                recorder.add_frame(following, view.frames)
+                following = next(others, None)
+            progress.update(task, completed=(render.time - view.start) / (view.end - view.start))
+        recorder.add_events(camera.sensor.finish())
+
+
+def _renders(
+    settings: SimulationSettings, source: Source, stops: Int64[np.ndarray, " stops"], max_change: float
+) -> Iterator[Render]:
+    """Pictures at these times (ns), and as many between them as motion and brightness need."""
+    response = response_named(settings.sensor.response)
+    if isinstance(source, Pictures):
+        times = np.union1d(stops, source.times[(source.times > stops[0]) & (source.times < stops[-1])])
+        max_change = max_change if settings.sensor.cutoff_frequency else np.inf  # else all between is on a line
+        yield from adaptive_renders(source.brightness, times, max_change, response, threads=1)
+        return
+    assert isinstance(source, RenderedScene | TrainedRun)
+    for start, end in pairwise([*range(stops[0], max(stops[-1], stops[0] + 1), WINDOW), stops[-1]]):
+        within = np.union1d([start, end], stops[(stops > start) & (stops < end)])
+        times = render_times(source.camera, source.trajectory, source.depth, within, settings.max_displacement)
+        renders = adaptive_renders(source.brightness, times, max_change, response)
+        if start > stops[0]:
+            next(renders)  # the last one of the window before
+        yield from renders
+
+
+def _frames(settings: SimulationSettings, source: Source, exposures: Exposures) -> Iterator[Frame]:
+    """The frames of a camera of their own, which is only rendered during exposures."""
+    for stops in np.stack([exposures.opens, exposures.times, exposures.closes], axis=1):
+        for render in _renders(settings, source, np.unique(stops), np.inf):
+            frame = exposures.add(render.time, _shown(settings, render.brightness))
+            if frame is not None:
+                yield frame
+
+
+def _shown(settings: SimulationSettings, picture: Float[np.ndarray, "height width *channels"]) -> np.ndarray:
+    """What frames show of a picture, in colour or grey."""
+    return picture if settings.colour or picture.ndim == 2 else luma(torch.from_numpy(picture)).numpy()
+
+
+def _setup(settings: SimulationSettings, view: View, exposures: Exposures, sensor: EventSensor) -> Setup:
+    """What is known of the recording before the first picture."""
+    return Setup(
+        event_camera=view.event_camera,
+        frame_camera=view.frame_camera,
+        event_from_frame=view.event_from_frame,
+        trajectory=view.trajectory,
+        frame_times=exposures.times,
+        exposure=exposures.exposure,
+        contrast_thresholds=settings.sensor.contrast_thresholds,
+        pixel_thresholds=sensor.contrast_thresholds if settings.sensor.threshold_spread else None,
+        refractory_period=settings.sensor.refractory_period,
+        bayer_pattern=settings.bayer_pattern,
+        response=settings.sensor.response,
+        settings=_stated(settings, view, exposures),
+    )
+
+
+def _stated(settings: SimulationSettings, view: View, exposures: Exposures) -> dict[str, Any]:
+    """All settings, with what those that are None came to."""
+    stated = {**asdict(settings), "frame_settings": asdict(settings.frame)}
+    stated["duration"] = (view.end - view.start) * 1e-9
+    stated["num_frames"], stated["exposure_ms"] = len(exposures.times), exposures.exposure * 1e-6
+    if settings.scene and not (settings.pictures or settings.key_frames or settings.trajectory):
+        stated["motion"] = settings.motion or (settings.preset.motion if settings.preset else "shake")
+    return json.loads(json.dumps(stated, default=str))
+
+
+class _Recorder:
+    """Where events and frames go: the folder and, if there is one, the preview."""
+
+    def __init__(self, settings: SimulationSettings, writer: Writer, preview: Preview | None):
+        self._settings, self._writer, self._preview = settings, writer, preview
+
+    def add_events(self, events: Events) -> None:
+        """Adds events that lie after those added before."""
+        self._writer.add_events(events)
+        if self._preview is not None:
+            self._preview.add_events(events)
+
+    def add_frame(self, frame: Frame, source: Source) -> None:
+        """Adds the next frame, with its depth where the source knows it."""
+        depth = source.depth(frame.time) if isinstance(source, RenderedScene | TrainedRun) else None
+        shown, seed = self._settings.frame, self._settings.sensor.seed
+        sharp = develop(frame.sharp, shown, frame.number, False, seed)
+        blurred = None if frame.blurred is None else develop(frame.blurred, shown, frame.number, True, seed)
+        linear = (frame.sharp, frame.blurred) if shown.hdr else None
+        self._writer.add_frame(frame.number, frame.time, sharp, blurred, depth, linear)
+        if self._preview is not None:
+            self._preview.add_frame(sharp, blurred, depth)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()

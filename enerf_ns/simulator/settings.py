@@ -1,0 +1,174 @@
+"""What is simulated, and how: the settings of `engine.simulate`, which are the flags of `enerf simulate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads these annotations on Python 3.10
+
+import numpy as np
+import tyro
+
+from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.formats.registry import layouts, writer_of
+from enerf_ns.simulator.event_sensor import SensorSettings
+from enerf_ns.simulator.frames import FrameSettings
+from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
+from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT
+from enerf_ns.simulator.scene.scenes import SCENES
+
+if TYPE_CHECKING:
+    Layout = str
+else:
+    Layout = Literal[layouts()]
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """What is seen, how the camera moves, and what the sensors of events and of frames are like.
+
+    Settings that contradict one another are refused where they are used, by `resolve`.
+    """
+
+    scene: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
+    """What is seen: a preset (spiral1, spiral2, shake-moon1, shake-moon2, shake-carpet1), a scene (shapes, carpet,
+    roads, moon, board), a mesh (.glb, .gltf, .obj, .ply, .stl), a scene file (.json), a folder of images, a video."""
+    from_run: Optional[Path] = None  # noqa: UP045
+    """config.yml of a run of Nerfstudio, which is rendered instead of a scene."""
+    motion: Optional[Literal["shake", "spiral"]] = None  # noqa: UP045
+    """How the camera moves: forward-facing with abrupt turns, or an inward spiral. None: as the preset, or shake."""
+    key_frames: Optional[Path] = None  # noqa: UP045
+    """Text file of the camera's places and targets instead, `t x y z tx ty tz` a line: seconds, metres, z up."""
+    trajectory: Optional[Path] = None  # noqa: UP045
+    """Recording, or text file of poses, `t px py pz qx qy qz qw` a line, whose motion is used instead."""
+    trajectory_unit: Literal["s", "us", "ns"] = "s"
+    """Unit of the times of a file of poses."""
+    duration: Optional[float] = None  # noqa: UP045
+    """Length of the recording in seconds. None: that of the preset, the trajectory or the video, or 1."""
+    num_frames: Optional[int] = None  # noqa: UP045
+    """Frames, at regular times. None: as many a second as the preset, or 41."""
+    exposure_ms: Optional[float] = None  # noqa: UP045
+    """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
+    preset, or 20, but no longer than from one frame to the next."""
+    width: Optional[int] = None  # noqa: UP045
+    """Of events and frames, in pixels. None: as the preset or the run, or 160; in proportion, if height is given."""
+    height: Optional[int] = None  # noqa: UP045
+    """Of events and frames, in pixels. None: as the preset or the run, or 120; in proportion, if width is given."""
+    field_of_view: Optional[float] = None  # noqa: UP045
+    """Horizontal, in degrees. None: as the preset or the run, or 60."""
+    cameras: Optional[Path] = None  # noqa: UP045
+    """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
+    layout: Optional[Layout] = None  # noqa: UP045
+    """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim, and for
+    images, videos, runs and colour filters this package's own."""
+    colour: Annotated[bool, tyro.conf.arg(aliases=["--color"])] = False
+    """Frames in colour, where the scene is."""
+    bayer_pattern: Optional[str] = None  # noqa: UP045
+    """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; None: a grey sensor."""
+    frames_per_second: Optional[float] = None  # noqa: UP045
+    """How fast a video, or the images of a folder, were recorded. None: as fast as the video is played."""
+    stamps: Optional[Path] = None  # noqa: UP045
+    """Text file with the times of the images of a folder in seconds, one a line."""
+    gamma: bool = True
+    """Take the images of a folder or a video for sRGB, not for linear brightness."""
+    contrast_thresholds: Optional[tuple[float, float]] = None  # noqa: UP045
+    """Change of log brightness that makes an on event, and an off event. None: as the preset, or 0.25 0.25."""
+    max_displacement: float = MAX_DISPLACEMENT
+    """Pixels that a point may move at most from one picture to the next that events are made of."""
+    max_change: float = MAX_CHANGE
+    """By how much a pixel's log brightness may change at most before it is rendered again, between pictures."""
+    sensor: Annotated[SensorSettings, tyro.conf.arg(name="")] = field(default_factory=SensorSettings)
+    """Of events."""
+    frame: FrameSettings = field(default_factory=FrameSettings)
+    """The sensor of the frames."""
+
+    @property
+    def pictures(self) -> Path | None:
+        """The folder of images or the video that is seen, if it is one."""
+        if self.scene is None or self.scene in PRESETS or self.scene in SCENES:
+            return None
+        path = Path(self.scene).expanduser()
+        return path if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES else None
+
+    @property
+    def preset(self) -> SimulationPreset | None:
+        """What the scene stands for, if it is a preset."""
+        return PRESETS.get(self.scene or "")
+
+
+DEFAULTS = {setting.name: setting.default for setting in fields(SimulationSettings)}
+
+
+def resolve(settings: SimulationSettings) -> SimulationSettings:
+    """The settings with the layout and the sensor's contrast thresholds that they come to.
+
+    Raises:
+        FlagError: One is out of its range, contradicts another, or changes nothing.
+    """
+    _check_ranges(settings)
+    if bool(settings.scene) == (settings.from_run is not None):
+        raise FlagError("Give either what is to be seen, such as shapes or a mesh, or --from-run config.yml.")
+    layout = settings.layout
+    if layout is None:
+        layout = "event_recording" if settings.pictures or settings.from_run or settings.bayer_pattern else "esim"
+    if settings.bayer_pattern and layout != "event_recording":
+        raise FlagError(f"--layout {layout} has no place for a --bayer-pattern; give --layout event_recording.")
+    if settings.pictures and layout != "event_recording":
+        raise FlagError(
+            f"{settings.pictures} has pictures and no poses, which --layout {layout} needs; give --layout "
+            "event_recording."
+        )
+    _check_use(settings, layout)
+    sensor = settings.sensor
+    thresholds = settings.contrast_thresholds or (settings.preset and settings.preset.contrast_thresholds)
+    if thresholds:
+        sensor = replace(sensor, contrast_thresholds=thresholds)
+    return replace(settings, layout=layout, sensor=sensor)
+
+
+def _check_ranges(settings: SimulationSettings) -> None:
+    for name, fine, expected in (
+        ("duration", lambda v: 1e-3 <= v <= 1000, "seconds from 0.001 to 1000"),
+        ("num_frames", lambda v: v > 0, "at least 1"),
+        ("exposure_ms", lambda v: 0 <= v < np.inf, "milliseconds from 0 on"),
+        ("width", lambda v: 0 < v < 2**15, "pixels above 0"),
+        ("height", lambda v: 0 < v < 2**15, "pixels above 0"),
+        ("field_of_view", lambda v: 0 < v < 180, "degrees between 0 and 180"),
+        ("max_displacement", lambda v: 0 < v < np.inf, "pixels above 0"),
+        ("max_change", lambda v: 0 < v < np.inf, "a change of log brightness above 0"),
+        ("bayer_pattern", lambda v: len(v) == 4 and set(v) <= set("RGB"), "four letters of R, G and B"),
+    ):
+        value = getattr(settings, name)
+        if value is not None and not fine(value):
+            raise FlagError(f"--{name.replace('_', '-')} is {value}, but must be {expected}.")
+
+
+def _check_use(settings: SimulationSettings, layout: str) -> None:
+    """Refuses settings that would change nothing."""
+    pictures, trajectory = settings.pictures, settings.trajectory
+    poses_file = trajectory is not None and not trajectory.expanduser().is_dir()
+    sizes = ("--width", "--height", "--field-of-view")
+    rig = writer_of(layout).published_rig
+    own_rig = rig is not None and settings.cameras is None and settings.from_run is None and pictures is None
+    for applies, situation, useless in (
+        (pictures, "for pictures, which have their size and no poses",
+         ("--motion", "--key-frames", "--trajectory", "--cameras", "--width", "--height", "--max-displacement")),
+        (pictures and not settings.sensor.cutoff_frequency, "for pictures without --cutoff-frequency",
+         ("--max-change",)),
+        (pictures is None, "without a folder of images or a video",
+         ("--frames-per-second", "--stamps", "--no-gamma")),
+        (pictures and pictures.is_file(), "for a video", ("--stamps",)),
+        (settings.from_run, "for a trained run", ("--motion", "--cameras")),
+        (settings.key_frames, "beside --key-frames", ("--motion", "--trajectory")),
+        (trajectory, "beside --trajectory", ("--motion",)),
+        (not poses_file, "unless --trajectory is a text file of poses", ("--trajectory-unit",)),
+        (settings.cameras, "beside --cameras", sizes),
+        (own_rig, f"in the layout {layout} without --cameras, whose cameras are those of the data set "
+         f"({rig[0].width} x {rig[0].height} pixels)" if rig else "", sizes),
+    ):  # fmt: skip
+        for flag in useless:
+            name = flag.removeprefix("--no-").removeprefix("--").replace("-", "_")
+            if applies and getattr(settings, name) != DEFAULTS[name]:
+                raise FlagError(f"{flag} changes nothing {situation}; leave it out.")

@@ -1,0 +1,210 @@
+"""What is looked at, by which cameras, from where and how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.formats.event_recording import read_cameras
+from enerf_ns.dataparsers.formats.registry import writer_of
+from enerf_ns.dataparsers.formats.writer import is_second_camera
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.sensor.response import response_named
+from enerf_ns.simulator.paper_sequences import PRESETS
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scene_files import load_scene
+from enerf_ns.simulator.scene.scenes import SCENES, Scene
+from enerf_ns.simulator.scene.view_check import check_view
+from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.sources import ImageFolder, RenderedScene, Source, TrainedRun, Video
+from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
+
+SECONDS, SIZE, FIELD_OF_VIEW = 1.0, (160, 120), 60.0
+"""Of a recording for which neither a preset nor a setting states them."""
+
+MOST_PIXELS = 2**24
+"""Of a camera; rendering takes up to a kilobyte of memory for each."""
+
+SPARSE = 20_000_000
+"""Nanoseconds between poses, above which they are made denser where a second camera is mounted on the first."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is looked at, by which cameras, from where and how long."""
+
+    events: Source
+    """As the event camera sees it."""
+    frames: Source | None
+    """As the camera of the frames sees it; None: that of the events takes them."""
+    trajectory: Trajectory | None
+    """Of the event camera; None for pictures."""
+    event_camera: Camera
+    frame_camera: Camera
+    event_from_frame: Float64[np.ndarray, "4 4"]
+    """Pose of the camera of the frames in the axes of that of the events, metres."""
+    start: int
+    """ns"""
+    end: int
+    """ns"""
+
+
+def view_of(settings: SimulationSettings, notes: list[str]) -> View:
+    """Makes or loads what is to be seen.
+
+    Args:
+        settings: As `settings.resolve` returns them.
+        notes: Gets what the user should know, one sentence each.
+
+    Raises:
+        RecordingError: What is to be seen, cameras or a trajectory cannot be read or used.
+        FlagError: The recording would last longer than the trajectory or the video, or a camera has too many pixels.
+    """
+    if settings.pictures is not None:
+        return _pictures_view(settings, settings.pictures)
+    if settings.from_run is not None:
+        return _run_view(settings, settings.from_run, notes)
+    return _scene_view(settings, notes)
+
+
+def _pictures_view(settings: SimulationSettings, path: Path) -> View:
+    rate, response = settings.frames_per_second, response_named(settings.sensor.response)
+    if path.is_dir():
+        stamps = settings.stamps and settings.stamps.expanduser()
+        source = ImageFolder(path, rate, stamps, gamma=settings.gamma, response=response)
+    else:
+        source = Video(path, rate, settings.gamma, response)
+    camera = _centred(source.width, source.height, settings.field_of_view or FIELD_OF_VIEW)
+    return View(source, None, None, camera, camera, np.eye(4), source.start, _end(settings, source.end, str(path)))
+
+
+def _run_view(settings: SimulationSettings, config: Path, notes: list[str]) -> View:
+    duration = _duration(settings) or round(SECONDS * 1e9)
+    run = TrainedRun(config.expanduser().resolve(), _given_trajectory(settings, notes), duration)
+    if settings.width or settings.height or settings.field_of_view:
+        run.camera = _pinhole(settings, run.camera)
+    end = _end(settings, run.end, str(settings.trajectory or settings.key_frames or config))
+    return View(run, None, run.trajectory, run.camera, run.camera, np.eye(4), run.start, end)
+
+
+def _scene_view(settings: SimulationSettings, notes: list[str]) -> View:
+    assert settings.scene is not None
+    scene_rng, motion_rng = np.random.default_rng(settings.sensor.seed).spawn(2)
+    scene = _scene(settings, settings.scene, scene_rng, notes)
+    trajectory = _motion(settings, scene, motion_rng, notes)
+    event_camera, frame_camera, event_from_frame = _cameras(settings)
+    has_two = is_second_camera(event_camera, frame_camera, event_from_frame)
+    if has_two and np.diff(trajectory.times).max() > SPARSE:
+        trajectory = sampled(trajectory, POSES_PER_SECOND)  # so that both cameras stay as they are mounted
+    sources = [RenderedScene(Renderer(scene, event_camera), trajectory)]
+    if has_two:
+        sources.append(RenderedScene(Renderer(scene, frame_camera), trajectory.of_mounted(event_from_frame)))
+    end = _end(settings, trajectory.end, str(settings.trajectory or settings.key_frames))
+    names = ("the event camera", "the frame camera") if has_two else ("the camera",)
+    for name, source in zip(names, sources, strict=True):
+        check_view(settings.scene, name, source, trajectory.start, end, notes)
+    frames = sources[1] if has_two else None
+    cameras = event_camera, frame_camera, event_from_frame
+    return View(sources[0], frames, trajectory, *cameras, trajectory.start, end)
+
+
+def _scene(settings: SimulationSettings, name: str, rng: np.random.Generator, notes: list[str]) -> Scene:
+    if settings.preset is not None:
+        name = settings.preset.scene
+    if name in SCENES:
+        scene = SCENES[name](rng)
+    else:
+        path = Path(name).expanduser()
+        if not path.exists():
+            raise RecordingError(
+                f"{name} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file or "
+                "folder that exists; give one of these."
+            )
+        scene = load_scene(path, rng, notes)
+    return scene if settings.colour or settings.bayer_pattern else scene.grey()
+
+
+def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator, notes: list[str]) -> Trajectory:
+    """Of the event camera, with as many poses as the layout has."""
+    trajectory, preset = _given_trajectory(settings, notes), settings.preset
+    if trajectory is None and preset is not None:
+        moved = replace(preset, duration=settings.duration or preset.duration, motion=settings.motion or preset.motion)
+        trajectory = moved.trajectory(scene.camera, scene.target, rng)
+    elif trajectory is None:
+        motion, duration = MOTIONS[settings.motion or "shake"], _duration(settings) or round(SECONDS * 1e9)
+        trajectory = motion(duration, scene.camera, scene.target, rng)
+    assert settings.layout is not None
+    poses_per_second = writer_of(settings.layout).poses_per_second
+    if poses_per_second is None:
+        return trajectory
+    thinned, given = sampled(trajectory, poses_per_second), settings.trajectory or settings.key_frames
+    if given and thinned is not trajectory:
+        notes.append(
+            f"{given} is followed through {poses_per_second} poses a second, as many as the layout "
+            f"{settings.layout} has."
+        )
+    return thinned
+
+
+def _given_trajectory(settings: SimulationSettings, notes: list[str]) -> Trajectory | None:
+    if settings.key_frames is not None:
+        return key_frames(settings.key_frames.expanduser())
+    if settings.trajectory is not None:
+        return from_file(settings.trajectory.expanduser(), notes, settings.trajectory_unit)
+    return None
+
+
+def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
+    """Of events and of frames, and the pose of the latter in the axes of the former."""
+    assert settings.layout is not None
+    rig = writer_of(settings.layout).published_rig
+    if settings.cameras is not None:
+        rig = read_cameras(settings.cameras.expanduser())
+    elif rig is None:
+        camera = _pinhole(settings)
+        rig = camera, camera, np.eye(4)
+    for camera in rig[:2]:
+        if camera.width * camera.height > MOST_PIXELS:
+            raise FlagError(
+                f"A camera of {camera.width} x {camera.height} pixels is too large to be simulated; give one of at "
+                f"most {MOST_PIXELS:,} pixels."
+            )
+    return rig
+
+
+def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera:
+    """As the settings, and where they are None as another camera or the preset has it."""
+    usual, angle = SIZE, FIELD_OF_VIEW
+    if like is not None:
+        usual, angle = (like.width, like.height), 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
+    elif settings.preset is not None:
+        usual, angle = (settings.preset.width, settings.preset.height), settings.preset.field_of_view
+    width = settings.width or max(1, round((settings.height or usual[1]) * usual[0] / usual[1]))
+    height = settings.height or max(1, round(width * usual[1] / usual[0]))
+    return _centred(width, height, settings.field_of_view or angle)
+
+
+def _centred(width: int, height: int, field_of_view: float) -> Camera:
+    """A pinhole camera that looks through the middle of its picture, as the ESIM layout wants it; degrees."""
+    focal_length = float(width / 2 / np.tan(np.radians(field_of_view / 2)))
+    return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+
+
+def _duration(settings: SimulationSettings) -> int | None:
+    """ns"""
+    return None if settings.duration is None else round(settings.duration * 1e9)
+
+
+def _end(settings: SimulationSettings, last: int, name: str) -> int:
+    """When the recording ends (ns), of what is called so and can be seen until `last`."""
+    wanted = _duration(settings)
+    if wanted is not None and wanted > last:
+        raise FlagError(
+            f"--duration is {settings.duration:g} s, but {name} lasts {last * 1e-9:.9g} s; give less or leave it out."
+        )
+    return last if wanted is None else wanted

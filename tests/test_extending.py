@@ -1,0 +1,138 @@
+"""A data set, a loss and a parameter of the sensor are added from outside the package, as a user would, and train."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+from small_runs import set_up, small_config
+from torch import Tensor, nn
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.event_dataparser import specification
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.registry import read_recording, register
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Events
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
+from enerf_ns.supervision.event_supervision import EVENT_LOSSES
+
+
+def read_two_arrays(folder: Path) -> EventRecording:
+    """A reader: events.npy has rows x y t_us p, poses.npy rows t_us px py pz qx qy qz qw."""
+    events, poses = np.load(folder / "events.npy"), np.load(folder / "poses.npy")
+    x, y, t, p = events.T.astype(np.int64)
+    return EventRecording(
+        path=folder,
+        format="two_arrays",
+        camera=Camera(32, 24, 27.7, 27.7, 16.0, 12.0),
+        trajectory=Trajectory((1000 * poses[:, 0]).astype(np.int64), poses[:, 1:4], poses[:, 4:]),
+        stream_events=lambda: iter([Events(x, y, 1000 * t, p)]),
+        event_files=(folder / "events.npy",),
+        depth_range=(0.5, 5.0),
+    )
+
+
+TWO_ARRAYS = Format("two_arrays", "two-arrays", "Two arrays.", ("events.npy", "poses.npy"), read_two_arrays)
+register(TWO_ARRAYS)
+two_arrays = specification(TWO_ARRAYS)
+"""What an entry point of the group nerfstudio.dataparser_configs names, for `ns-train enerf two-arrays --data ...`."""
+
+
+def cauchy_loss(predicted: Tensor, measured: Tensor, mean_threshold: float | Tensor) -> Tensor:
+    """A loss that counts wrong pairs even less than Huber's."""
+    return torch.log1p(((predicted - measured) / mean_threshold) ** 2).mean()
+
+
+EVENT_LOSSES["cauchy"] = cauchy_loss
+
+
+class LearnedRatio(SensorModel):
+    """A sensor parameter: the ratio of the contrast thresholds, whose product stays as it is."""
+
+    def __init__(self, config: SensorModelConfig):
+        super().__init__(config)
+        self.log_ratio = nn.Parameter(torch.zeros(()))
+
+    @property
+    def contrast_thresholds(self) -> tuple[float | Tensor, float | Tensor]:
+        on, off = super().contrast_thresholds
+        return on * torch.exp(0.5 * self.log_ratio), off * torch.exp(-0.5 * self.log_ratio)
+
+
+@dataclasses.dataclass
+class LearnedRatioConfig(SensorModelConfig):
+    _target: type[SensorModel] = dataclasses.field(default_factory=lambda: LearnedRatio)
+
+
+@pytest.fixture(scope="module")
+def two_arrays_folder(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small simulated recording in the layout of the reader above."""
+    folder = tmp_path_factory.mktemp("two_arrays")
+    simulated = read_recording(recording)
+    events, poses = index_events(simulated).events(), simulated.trajectory
+    np.save(folder / "events.npy", np.column_stack([events.x, events.y, events.t // 1000, events.p]))
+    np.save(folder / "poses.npy", np.column_stack([poses.times / 1000, poses.positions, poses.quaternions]))
+    return folder
+
+
+def two_steps(config: Any) -> Any:
+    """Trains two steps; the trainer. Every loss is finite, and every parameter moves."""
+    trainer = set_up(config)
+    before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.named_parameters()}
+    trainer.train()
+    for name, parameter in trainer.pipeline.model.named_parameters():
+        moved = parameter.numel() == 0 or (parameter != before[name]).any()  # Nerfstudio keeps an empty one
+        assert parameter.isfinite().all() and moved, name
+    return trainer
+
+
+def test_a_reader_of_ones_own(two_arrays_folder: Path, tmp_path: Path):
+    """The folder is found to have its format, and is trained on."""
+    trainer = two_steps(small_config(two_arrays_folder, tmp_path))
+    assert trainer.pipeline.datamanager.recording.format == "two_arrays"
+    assert two_arrays.config.format == "two_arrays"
+
+
+def test_a_reader_of_ones_own_can_be_named(two_arrays_folder: Path, tmp_path: Path):
+    config = small_config(two_arrays_folder, tmp_path)
+    config.pipeline.datamanager.dataparser = dataclasses.replace(two_arrays.config)  # type: ignore[type-var]
+    assert two_steps(config).pipeline.datamanager.recording.format == "two_arrays"
+
+
+def test_a_loss_of_ones_own(recording: Path, tmp_path: Path):
+    trainer = two_steps(small_config(recording, tmp_path, model__event_loss="cauchy"))
+    pipeline = trainer.pipeline
+    batch = pipeline.datamanager.next_batch(pipeline.model.sensor)
+    outputs = pipeline.model(pipeline.datamanager.rays(batch, pipeline.model.sensor))
+    start, end, _ = batch.split(outputs["rgb"])
+    sensor, events = pipeline.model.sensor, batch.events
+    change = sensor.log_brightness(end, events.pixels) - sensor.log_brightness(start, events.pixels)
+    measured = sensor.measured_change(events.on, events.off, events.pixels)
+    loss = pipeline.model.get_loss_dict(outputs, batch)["event_loss"]
+    torch.testing.assert_close(loss, cauchy_loss(change, measured, sensor.mean_threshold))
+
+
+def test_a_parameter_of_the_sensor(recording: Path, tmp_path: Path):
+    """It is trained with a learning rate of its own, stored with the run, and loaded."""
+    config = small_config(recording, tmp_path)
+    config.pipeline.model.sensor = LearnedRatioConfig()
+    trainer = two_steps(config)
+    sensor = trainer.pipeline.model.sensor
+    assert isinstance(sensor, LearnedRatio) and sensor.log_ratio.item() != 0
+    assert set(trainer.optimizers.optimizers) == {"fields", "sensor"}
+    assert trainer.optimizers.config["sensor"]["optimizer"].lr != trainer.optimizers.config["fields"]["optimizer"].lr
+    loaded: Any = eval_setup(trainer.base_dir / "config.yml")[1]
+    torch.testing.assert_close(loaded.model.sensor.log_ratio, sensor.log_ratio, rtol=0, atol=0)
+
+
+def test_all_three_at_once(two_arrays_folder: Path, tmp_path: Path):
+    config = small_config(two_arrays_folder, tmp_path, model__event_loss="cauchy")
+    config.pipeline.model.sensor = LearnedRatioConfig()
+    two_steps(config)
