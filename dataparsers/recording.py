@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +146,7 @@ class EventRecording:
         self._set(**covered, notes=tuple(notes), shares_outside_poses=shares)
 
     def selected(self, time_range: tuple[float, float] | None, keep_hot_pixels: bool) -> EventRecording:
-        """The same recording, of which a part of the events is used.
+        """The recording of which a part of the events is used; for one selection always the same object.
 
         Args:
             time_range: First and last time in seconds on the recording's clock, or None for all.
@@ -155,7 +156,9 @@ class EventRecording:
             FlagError: The range holds no poses.
         """
         nanoseconds = time_range and (round(time_range[0] * 1e9), round(time_range[1] * 1e9))
-        selection = replace(self, time_range=nanoseconds, keep_hot_pixels=keep_hot_pixels)
+        selection = self
+        if (nanoseconds, keep_hot_pixels) != (self.time_range, self.keep_hot_pixels):
+            selection = _with_selection(self, nanoseconds, keep_hot_pixels)
         start, end = selection.span
         if time_range is not None and not start < end:
             raise FlagError(
@@ -246,6 +249,11 @@ def _is_response(name: object) -> bool:
         return kind == "logarithm" and 0 < float(offset) < np.inf
     except ValueError:
         return False
+
+
+@cache
+def _with_selection(recording: EventRecording, time_range: tuple[int, int] | None, keep: bool) -> EventRecording:
+    return replace(recording, time_range=time_range, keep_hot_pixels=keep)
 
 
 def left_out(dropped: int, total: int, what: str) -> str:

@@ -75,7 +75,7 @@ class EnerfField(Field):
         num_channels: 1 for grey, 3 for colour.
         view_direction: Whether colour depends on the direction from which a point is seen.
         density: Keywords of `HashDensity`.
-        hidden_dim_color: Width of the hidden layers of the colour network.
+        hidden_dim_colour: Width of the hidden layers of the colour network.
         log_sigmoid: Let a sigmoid span log brightness, from `DARKEST` to 1, so that the field starts in the middle of
             what the sensor can tell apart; else brightness itself, as in the paper, which starts near its upper end.
     """
@@ -86,7 +86,7 @@ class EnerfField(Field):
         *,
         num_channels: int,
         view_direction: bool,
-        hidden_dim_color: int,
+        hidden_dim_colour: int,
         num_features: int,
         log_sigmoid: bool,
         **density,
@@ -96,10 +96,10 @@ class EnerfField(Field):
         self.geometry = HashDensity(aabb, num_features=num_features, **density)
         self.direction_encoding = SHEncoding(levels=4, implementation="torch") if view_direction else None
         directions = self.direction_encoding.get_out_dim() if self.direction_encoding else 0
-        self.color_network = MLP(
+        self.colour_network = MLP(
             in_dim=directions + num_features,
             num_layers=3 if view_direction else 2,
-            layer_width=hidden_dim_color,
+            layer_width=hidden_dim_colour,
             out_dim=num_channels,
             activation=nn.ReLU(),
             implementation="torch",
@@ -117,5 +117,5 @@ class EnerfField(Field):
             directions = get_normalized_directions(ray_samples.frustums.directions)
             encoded = self.direction_encoding(directions.reshape(-1, 3)).view(*directions.shape[:-1], -1)
             inputs = torch.cat([encoded, inputs], dim=-1)
-        color = torch.sigmoid(self.color_network(inputs))
-        return {FieldHeadNames.RGB: DARKEST ** (1.0 - color) if self.log_sigmoid else color}
+        colour = torch.sigmoid(self.colour_network(inputs))
+        return {FieldHeadNames.RGB: DARKEST ** (1.0 - colour) if self.log_sigmoid else colour}

@@ -45,7 +45,7 @@ class EnerfModelConfig(ModelConfig):
     """Base-2 logarithm of the entries of each level."""
     hidden_dim: int = 32
     """Width of the density network."""
-    hidden_dim_color: int = 32
+    hidden_dim_colour: Annotated[int, tyro.conf.arg(aliases=["--pipeline.model.hidden-dim-color"])] = 32
     """Width of the colour network."""
     num_features: int = 15
     """What the density network tells the colour network."""
@@ -89,6 +89,8 @@ class EnerfModelConfig(ModelConfig):
         thresholds = state.pop("contrast_thresholds", None)
         if "sensor" not in state:
             state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
+        if "hidden_dim_color" in state:
+            state["hidden_dim_colour"] = state.pop("hidden_dim_color")
         self.__dict__.update(state)
 
 
@@ -126,7 +128,7 @@ class EnerfModel(Model):
             aabb,
             num_channels=config.num_channels,
             view_direction=config.view_direction,
-            hidden_dim_color=config.hidden_dim_color,
+            hidden_dim_colour=config.hidden_dim_colour,
             log_sigmoid=config.brightness == "log-sigmoid",
             num_features=config.num_features,
             num_levels=config.num_levels,
@@ -193,8 +195,8 @@ class EnerfModel(Model):
         accumulation = self.renderer_accumulation(weights=weights)
         rgb = field_outputs[FieldHeadNames.RGB]
         background = paired_rand(ray_bundle, 1) if self.training else torch.zeros_like(accumulation)
-        color = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
-        outputs = {"rgb": color.expand(-1, 3), "accumulation": accumulation}
+        colour = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
+        outputs = {"rgb": colour.expand(-1, 3), "accumulation": accumulation}
         with torch.no_grad():
             outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         if self.training:
@@ -276,5 +278,9 @@ class EnerfModel(Model):
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
-        """Always strict: parameters that do not fit are an error, never a silently random field."""
+        """Always strict: parameters that do not fit are an error, never a silently random field.
+
+        Checkpoints of earlier versions spell colour_network another way.
+        """
+        state_dict = {name.replace("color_network", "colour_network"): value for name, value in state_dict.items()}
         return super().load_state_dict(state_dict, strict=True, assign=assign)

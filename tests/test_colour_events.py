@@ -163,7 +163,7 @@ def test_an_event_teaches_its_own_channel_alone(recording: EventRecording, chann
     batch = replace(batch, events=replace(batch.events, pixels=pixels % 2 + WIDTH * (pixels // 2)))
     outputs = pipeline.model(rays)
     losses = pipeline.model.get_loss_dict(outputs, batch)
-    weight = pipeline.model.field.color_network.layers[-1].weight
+    weight = pipeline.model.field.colour_network.layers[-1].weight
     for name, taught in {"event_loss": channel, "no_event_loss": (channel + 1) % 3}.items():
         (gradient,) = torch.autograd.grad(losses[name], weight, retain_graph=True)
         assert [bool(row.any()) for row in gradient] == [c == taught for c in range(3)]

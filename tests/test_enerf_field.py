@@ -15,7 +15,7 @@ GRID: dict[str, Any] = {"num_levels": 3, "min_res": 4, "max_res": 16, "log2_tabl
 
 def field(**changes: Any) -> EnerfField:
     torch.manual_seed(0)
-    settings: dict[str, Any] = {"num_channels": 3, "view_direction": False, "hidden_dim_color": 16, "num_features": 7}
+    settings: dict[str, Any] = {"num_channels": 3, "view_direction": False, "hidden_dim_colour": 16, "num_features": 7}
     made = EnerfField(AABB, **{**settings, "log_sigmoid": True, **GRID, **changes})
     torch.nn.init.normal_(made.geometry.grid.table)
     return made

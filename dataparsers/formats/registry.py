@@ -72,7 +72,7 @@ def read_recording(
         RecordingError: The folder is of no known format, or anything in it cannot be used.
         FlagError: There is no such format, it lacks an option, or the range of time holds no poses.
     """
-    return _read_recording(Path(path).resolve(), format, time_range, keep_hot_pixels, **options)
+    return _read_folder(Path(path).resolve(), format, **options).selected(time_range, keep_hot_pixels)
 
 
 def layouts() -> tuple[str, ...]:
@@ -112,7 +112,7 @@ for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
 
 
 @cache
-def _read_recording(path: Path, format: str, time_range, keep_hot_pixels: bool, **options: object) -> EventRecording:
+def _read_folder(path: Path, format: str, **options: object) -> EventRecording:
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give the folder of a recording.")
     if not path.is_dir():
@@ -120,8 +120,7 @@ def _read_recording(path: Path, format: str, time_range, keep_hot_pixels: bool, 
     found = _find_format(path) if format == "auto" else format_named(format)
     _check_options(path, found, options)
     with of_file(path):
-        recording = found.read(path, **options)
-    return recording.selected(time_range, keep_hot_pixels)
+        return found.read(path, **options)
 
 
 def _check_options(path: Path, found: Format, options: dict[str, object]) -> None:

@@ -43,9 +43,9 @@ def test_load_image_gives_one_or_three_channels_of_uint8(tmp_path: Path, mode: s
 def test_what_is_transparent_is_laid_over_white(tmp_path: Path):
     pixels = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "image.png")
-    color, alpha = pixels[..., :3].astype(float), pixels[..., 3:] / 255
+    colour, alpha = pixels[..., :3].astype(float), pixels[..., 3:] / 255
     found = load_image(tmp_path / "image.png")
-    np.testing.assert_allclose(found, alpha * color + (1 - alpha) * 255, atol=1)
+    np.testing.assert_allclose(found, alpha * colour + (1 - alpha) * 255, atol=1)
     opaque = pixels[..., 3] == 255
     np.testing.assert_array_equal(found[opaque], pixels[opaque, :3])
 

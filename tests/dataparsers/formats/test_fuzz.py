@@ -37,7 +37,7 @@ from test_bad_input import contents, is_one_sentence
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import load_array, load_image
-from enerf_ns.dataparsers.formats.registry import _read_recording, read_recording
+from enerf_ns.dataparsers.formats.registry import _read_folder, read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -720,7 +720,7 @@ def check_frames(recording: EventRecording, undamaged: EventRecording) -> None:
 
 def read_or_refuse(folder: Path, format: str) -> tuple[EventRecording, dict[str, Any]] | None:
     """A recording and its facts, or None where it is refused with one sentence that says where."""
-    _read_recording.cache_clear()  # of cameras with tables of megabytes
+    _read_folder.cache_clear()  # of cameras with tables of megabytes
     try:
         recording = read_recording(folder, format)
         return recording, facts(recording)

@@ -66,10 +66,10 @@ def basket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (folder / "a.basket").touch()
     (folder / "eggs/1").touch()
     yield folder
-    registry._read_recording.cache_clear()
+    registry._read_folder.cache_clear()
 
 
-def test_read_recording_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_read_folder_finds_the_format_and_reads_a_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     davis, esim = write_davis(tmp_path / "davis"), write_esim(tmp_path / "esim")
     assert read_recording(davis).format == "davis"
     assert read_recording(esim).format == "esim"
