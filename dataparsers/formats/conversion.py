@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.files import read_json, write_whole
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
@@ -128,7 +128,7 @@ def _new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
         )
     if output_dir == source or source in output_dir.parents:
-        raise FlagError(f"--output-dir {output_dir} lies in the recording, which is only read; give another one.")
+        raise OutputError(f"--output-dir {output_dir} lies in the recording, which is only read; give another one.")
     partial = output_dir.with_name(f".{output_dir.name}.partial-{os.getpid()}")
     try:
         partial.mkdir(parents=True)

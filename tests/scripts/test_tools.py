@@ -191,8 +191,9 @@ def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pyt
     assert "21 train and 20 held-out frames" in shown
     (file,) = Path("outputs").glob("carpet/enerf/*/config.yml")
     config = yaml.load(file.read_text(), Loader=yaml.Loader)
-    assert config.pipeline.model.contrast_thresholds == (0.2, 0.2)
-    assert config.pipeline.datamanager.dataparser.box == (0.0, 0.0, -1.0, 10.0)
+    used = config.pipeline.resolution.applied_to(config.pipeline)
+    assert used.model.sensor.contrast_thresholds == (0.2, 0.2)
+    assert used.datamanager.dataparser.box == (0.0, 0.0, -1.0, 10.0)
     call("ns-eval", "--load-config", file, "--output-path", "scores.json", "--render-output-path", "pictures")
     assert len(list(Path("pictures").iterdir())) == 20
 
@@ -290,12 +291,10 @@ def test_export_point_cloud(call, run: Path):
     cloud = open3d.io.read_point_cloud("cloud/point_cloud.ply")
     assert len(cloud.points) == 512
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-3)
-    config: Any
-    pipeline: Any
-    config, pipeline, _, _ = eval_setup(run)
+    pipeline: Any = eval_setup(run)[1]
     recording = pipeline.datamanager.train_dataset.recording
     distances = np.linalg.norm(np.asarray(cloud.points) - recording.trajectory.positions.mean(axis=0), axis=1)
-    near, far = config.pipeline.datamanager.dataparser.depth_range
+    near, far = pipeline.config.datamanager.dataparser.depth_range
     assert 0.8 * near < distances.min() and distances.max() < 1.5 * far, "the points lie in the scene, in metres"
 
 

@@ -64,7 +64,7 @@ def test_the_picture_moves_as_far_during_an_exposure_as_the_table_says(name: str
 def test_the_presets_of_training_fit(name: str):
     """Their frames exist, and what is seen lies in their box and beyond their nearest depth."""
     simulated = PRESETS[name]
-    (preset,) = (made for key, made in training.PRESETS.items() if key.lower() == name.replace("-", ""))
+    preset = training.PRESETS[name]
     assert simulated.num_frames - 1 in {max(preset.train_frames), max(preset.train_frames) + 1}
     assert max(preset.held_out_frames) < simulated.num_frames
     assert simulated.contrast_thresholds == preset.contrast_thresholds
