@@ -9,20 +9,17 @@ import pytest
 import torch
 import tyro
 import yaml
+from geometry import distance_to_rays, unproject
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from recordings import EVENTS, FRAME_TIMES, POSE_TIMES, poses, write_davis, write_esim
 from scipy.interpolate import CubicSpline
-from scipy.optimize import root
-from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers import event_dataparser
-from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.event_dataparser import (
     EventDataParserConfig,
-    scene_normalisation,
 )
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
@@ -33,50 +30,13 @@ from enerf_ns.event_dataset import EventDataset
 from enerf_ns.poses.posed_camera import PosedCamera
 
 NEAR, FAR = 0.5, 4.0
+
 FORMATS = {"esim": write_esim, "davis": write_davis}
 
 
 def parse(folder: Path, split: str = "train", **options) -> DataparserOutputs:
     config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR), **options)
     return config.setup().get_dataparser_outputs(split)
-
-
-def world_to_camera(time: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vector and translation as OpenCV takes them, from SciPy's interpolation of the poses in the file."""
-    rotation = Slerp(POSE_TIMES, Rotation.from_quat(poses()[:, 3:]))(time)
-    position = CubicSpline(POSE_TIMES, poses()[:, :3])(time)
-    return rotation.inv().as_rotvec(), -rotation.inv().apply(position)
-
-
-def project(point: np.ndarray, time: int, camera: Camera) -> np.ndarray:
-    """Pixel (x, y), integer at pixel centres, where a camera sees a point of the world; by OpenCV."""
-    rotation, translation = world_to_camera(time)
-    distortion = np.array(camera.distortion or [0.0] * 4)
-    return cv2.projectPoints(point[None], rotation, translation, camera.matrix, distortion)[0][0, 0]
-
-
-def unproject(pixel: np.ndarray, depth: float, time: int, camera: Camera) -> np.ndarray:
-    """The point of the world at a depth (along the optical axis) that OpenCV projects to a pixel, by root finding."""
-    rotation = Rotation.from_rotvec(world_to_camera(time)[0])
-    translation = world_to_camera(time)[1]
-
-    def world(image_plane: np.ndarray) -> np.ndarray:
-        return rotation.inv().apply(depth * np.array([*image_plane, 1.0]) - translation)
-
-    found = root(lambda image_plane: project(world(image_plane), time, camera) - pixel, [0.0, 0.0], tol=1e-12)
-    np.testing.assert_allclose(project(world(found.x), time, camera), pixel, atol=1e-6)
-    return world(found.x)
-
-
-def distance_to_rays(rays: RayBundle, points: np.ndarray, outputs: DataparserOutputs) -> np.ndarray:
-    """How far the rays pass by points of the world, in scene units."""
-    transform = outputs.dataparser_transform.double().numpy()
-    scene = outputs.dataparser_scale * (points @ transform[:, :3].T + transform[:, 3])
-    towards = scene - rays.origins.double().numpy()
-    directions = rays.directions.double().numpy()
-    along = np.sum(towards * directions, axis=-1)
-    assert (along > 0).all(), "the points lie behind the camera"
-    return np.linalg.norm(towards - along[:, None] * directions, axis=-1)
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -143,23 +103,6 @@ def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
     torch.testing.assert_close(event.directions, frame.directions, rtol=0, atol=1e-6)
     torch.testing.assert_close(event.metadata["directions_norm"], frame.metadata["directions_norm"])
     assert event.pixel_area[0].item() == pytest.approx(1 / 20**2)
-
-
-def test_the_box_holds_what_the_camera_sees_between_near_and_far(tmp_path: Path):
-    folder = write_davis(tmp_path / "davis")
-    recording = read_recording(folder)
-    transform, scale, box = scene_normalisation(recording, NEAR, FAR)
-    assert np.ptp(box, axis=0).max() == pytest.approx(2.0)
-    np.testing.assert_allclose(box.sum(axis=0), 0.0, atol=1e-9)
-
-    random = np.random.default_rng(0)
-    seen = []
-    for time in random.integers(recording.trajectory.start, recording.trajectory.end, 20):
-        for corner in ((0, 0), (23, 0), (0, 17), (23, 17)):
-            seen += [unproject(np.array(corner), depth, int(time), recording.camera) for depth in (NEAR, FAR)]
-    points = scale * (np.array(seen) @ transform[:, :3].T + transform[:, 3])
-    assert (points > box[0] - 1e-3).all() and (points < box[1] + 1e-3).all()
-    assert (np.ptp(points, axis=0) > 0.9 * np.ptp(box, axis=0)).all(), "the box is not much larger than that"
 
 
 def test_the_mean_up_direction_of_the_cameras_is_z(tmp_path: Path):
@@ -353,12 +296,3 @@ def test_a_time_range_limits_events_and_frames(tmp_path: Path):
     assert frame_numbers(outputs) == [1] and frame_numbers(parse(folder, "val", time_range=(0.2, 0.8))) == [1, 2]
     with pytest.raises(FlagError, match=r"--time-range 7 9 \(seconds\) holds none of the poses"):
         read_recording(folder, time_range=(7.0, 9.0))
-
-
-def test_a_box_is_a_cube_of_the_world(tmp_path: Path):
-    folder = write_esim(tmp_path / "esim")
-    outputs = parse(folder, box=(2.0, 1.0, -3.0, 4.0))
-    transform, scale = outputs.dataparser_transform.numpy(), outputs.dataparser_scale
-    for corner, mapped in (((-2, -3, -7), (-1, -1, -1)), ((6, 5, 1), (1, 1, 1)), ((2, 1, -3), (0, 0, 0))):
-        np.testing.assert_allclose(scale * (transform @ [*corner, 1.0]), mapped, atol=1e-6)
-    np.testing.assert_array_equal(outputs.scene_box.aabb, [[-1, -1, -1], [1, 1, 1]])

@@ -5,7 +5,6 @@ from collections import defaultdict
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import median_filter
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.event_index import EventIndex, event_picture, sorted_bands, survey_events
@@ -78,31 +77,6 @@ def test_events_outside_the_sensor_are_refused(x: int, y: int) -> None:
     )
     with pytest.raises(ValueError, match="outside the 4 x 3 sensor"):
         EventIndex.from_events(events, 4, 3)
-
-
-def test_hot_pixels_are_found_by_their_neighbourhood() -> None:
-    rng = np.random.default_rng(0)
-    width, height = 24, 18
-    counts = rng.poisson(20, (height, width))
-    counts[:, 12:] = rng.poisson(150, (height, 12))  # texture beside a plain region
-    counts[3, 4] = 2000
-    counts[0, 0] = 1500  # at the border
-    counts[9, 20] = 1000  # six times its neighbours: an edge
-    counts[17, 2] = 0
-    pixels = np.repeat(np.arange(width * height), counts.ravel())
-    rng.shuffle(pixels)
-    stream = [Events(pixels % width, pixels // width, np.arange(len(pixels)), np.ones(len(pixels), np.int8))]
-    survey = survey_events(lambda: iter(stream), width, height, 0, len(pixels))
-    np.testing.assert_array_equal(survey.counts, counts.ravel())
-    usual = median_filter(counts, size=5, mode="nearest")
-    survey.leave_out_hot_pixels(height)
-    np.testing.assert_array_equal(survey.hot_pixels, np.flatnonzero(counts > 10 * np.maximum(usual, 5)))
-    assert survey.hot_pixels.tolist() == [0, 3 * width + 4]
-    assert survey.num_hot_events == 3500
-    ((times, positives),) = sorted_bands(lambda: iter(stream), survey, 2**31)
-    kept = np.flatnonzero(~np.isin(pixels, survey.hot_pixels))
-    np.testing.assert_array_equal(times, kept[np.argsort(pixels[kept], kind="stable")])
-    np.testing.assert_array_equal(positives, np.arange(1, len(kept) + 1))
 
 
 def test_against_a_slow_dictionary_of_lists() -> None:

@@ -25,40 +25,6 @@ def recording(columns: np.ndarray, start: int = 0, end: int = 100, frame_times: 
     return EventRecording(Path("memory"), "test", CAMERA, trajectory, lambda: iter([Events(*columns.T)]), (), frames)
 
 
-def test_events_have_the_types_that_everything_builds_on():
-    events = index_events(recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [23, 17, 7, 1]]))).events()
-    assert [column.dtype for column in (events.x, events.y, events.t, events.p)] == [
-        np.uint16, np.uint16, np.int64, np.int8,
-    ]  # fmt: skip
-    assert events.x.tolist() == [1, 1, 23] and events.y.tolist() == [2, 2, 17] and events.t.tolist() == [5, 6, 7]
-    assert len(events) == 3
-
-
-@pytest.mark.parametrize(
-    ("off", "dtype"), [(0, bool), (0, np.uint8), (0, np.int8), (0, np.int64), (-1, np.int8), (-1, np.int64)]
-)
-def test_polarities_become_plus_and_minus_one(off: int, dtype: type):
-    events = recording(np.array([[1, 2, 5, 0], [1, 2, 6, 1], [1, 2, 7, 1]]))
-    (raw,) = events.stream_events()
-    signed = Events(raw.x, raw.y, raw.t, np.array([off, 1, off]).astype(dtype))
-    events = replace(events, stream_events=lambda: iter([signed]))
-    assert index_events(events).events().p.tolist() == [-1, 1, -1]
-
-
-def test_events_of_one_polarity_only_are_fine():
-    assert index_events(recording(np.array([[1, 2, 5, 1], [1, 2, 6, 1]]))).events().p.tolist() == [1, 1]
-    assert index_events(recording(np.array([[1, 2, 5, 0], [1, 2, 6, 0]]))).events().p.tolist() == [-1, -1]
-
-
-def test_events_outside_the_poses_are_dropped_and_counted():
-    times = np.array([9, 10, 10, 50, 100, 101])
-    rows = np.column_stack([np.full_like(times, 3), np.full_like(times, 4), times, np.ones_like(times)])
-    clipped = recording(rows, start=10)
-    assert index_events(clipped).events().t.tolist() == [10, 10, 50, 100]
-    assert index_events(clipped).notes == ("2 of 6 events (33 %) lie outside the poses and are left out.",)
-    assert index_events(clipped) is index_events(clipped)
-
-
 def test_frames_outside_the_poses_are_dropped_and_counted():
     rows = np.array([[1, 2, 5, 1], [1, 2, 6, 1]])
     clipped = recording(rows, start=10, frame_times=(9, 10, 100, 101))

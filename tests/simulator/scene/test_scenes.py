@@ -21,12 +21,16 @@ from enerf_ns.simulator.scene.scene_files import load_scene
 from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene, corner_normals
 
 RNG = np.random.default_rng
+
 COLOURS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [200, 120, 40]]], np.uint8)
 """A picture of 2 x 2 colours, so that a mirrored or turned one is recognised."""
+
 QUAD = np.array([[-1.0, 0.5], [1, 0.5], [1, -0.5], [-1, -0.5]])
 """To the right and upwards in metres: top left, top right, bottom right, bottom left."""
+
 FORWARD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """Pose of a camera at the origin that looks along y, with z upwards."""
+
 UNLIT = {"light": None}
 
 
@@ -152,20 +156,6 @@ def test_a_picture_is_seen_upright_and_in_linear_brightness(tmp_path, write):
     np.testing.assert_allclose(scene.texels_per_metre, 64 / np.sqrt(2), rtol=1e-6)
 
 
-def test_the_pyramid_holds_means_of_four_down_to_one_texel():
-    image = RNG(0).uniform(size=(8, 8, 3)).astype(np.float32)
-    pyramid = textures.mip_pyramid(image)
-    assert pyramid.shape == (64 + 16 + 4 + 1, 3) and pyramid.dtype == np.float32
-    np.testing.assert_array_equal(pyramid[:64].reshape(8, 8, 3), image)
-    for size in (8, 4, 2):
-        start, following = 4 * (64 - size**2) // 3, 4 * (64 - (size // 2) ** 2) // 3
-        finer = pyramid[start : start + size**2].reshape(size, size, 3)
-        for row, column in np.ndindex(size // 2, size // 2):
-            mean = finer[2 * row : 2 * row + 2, 2 * column : 2 * column + 2].mean((0, 1))
-            np.testing.assert_allclose(pyramid[following + row * (size // 2) + column], mean, atol=1e-6)
-    np.testing.assert_allclose(pyramid[-1], image.mean((0, 1)), atol=1e-6)
-
-
 def test_surfaces_become_one_scene_with_texels_per_metre_and_shared_textures():
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [0, 0.5, 0]])[None]
     stretched = corners[..., :2] * (2, 2)  # 4 x 1 textures on 2 m x 0.5 m
@@ -197,27 +187,6 @@ def test_a_grey_camera_sees_the_luma_of_a_coloured_texture():
     np.testing.assert_allclose(grey.shade, shade, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("shape", "size"), [((5, 3), 8), ((64, 64), 64), ((65, 10), 128), ((20, 5000), 2048), ((1, 1), 1)]
-)
-def test_pictures_of_any_size_become_squares_that_show_the_same(tmp_path, shape, size):
-    width = shape[1]
-    ramp = np.broadcast_to(np.linspace(40, 200, width).round().astype(np.uint8), shape)
-    Image.fromarray(np.ascontiguousarray(ramp)).save(tmp_path / "picture.png")
-    scene, _ = load(write_scene(tmp_path, {"shape": "plane", "texture": "picture.png"}))
-    assert scene.channels == 1 and scene.texture_size.tolist() == [size]
-    image = scene.texels[: size**2, 0].reshape(size, size)
-    assert np.ptp(image, axis=0).max() < 1e-6
-    expected = [to_linear(value / 255) for value in ramp[0].tolist()]
-    places = (np.arange(size) + 0.5) / size * width - 0.5
-    if width <= size:
-        np.testing.assert_allclose(image[0], np.interp(places, np.arange(width), expected), atol=2e-3)
-    else:
-        edges = np.linspace(0, width, size + 1)
-        whole = np.interp(edges, np.arange(width + 1), np.append(0, np.cumsum(expected)))
-        np.testing.assert_allclose(image[0], np.diff(whole) * size / width, atol=2e-3)
-
-
 def test_nodes_of_a_graph_are_placed_by_all_that_is_above_them(tmp_path):
     corners = np.array([[0.0, 0, 0], [1, 0, 0.2], [0, 1, -0.3]])
     about = gltf(corners, [[0, 1, 2]])
@@ -246,6 +215,7 @@ PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{vertex}"
     "element face 1\nproperty list uchar int vertex_indices\n{face}end_header\n{rows}"
 )
+
 RGB = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
 
 
@@ -402,7 +372,9 @@ def test_a_picture_lies_once_on_each_side_of_a_box_and_is_not_mirrored(tmp_path)
 
 
 BOX = {"shape": "box"}
+
 SHORT_PLY = PLY.format(vertex="", face="", rows="0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n").replace("face 1", "face 2")
+
 TRIANGLE = "0 2 0\n1 2 0\n0 2 1\n"
 
 
@@ -559,23 +531,6 @@ def test_the_same_seed_makes_the_same_preset(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", textures.PROCEDURAL)
-def test_procedural_textures_are_squares_within_their_range(name):
-    levels = textures.PROCEDURAL[name].make(RNG(0))
-    assert levels.dtype == np.float32 and levels.shape[0] == levels.shape[1]
-    assert 0 <= levels.min() and levels.max() <= 1
-    assert len(levels) & (len(levels) - 1) == 0
-
-
-@pytest.mark.parametrize("name", [pytest.param("roads", marks=pytest.mark.slow), "wood", "clouds"])
-def test_textures_that_repeat_have_no_seam(name):
-    levels = textures.PROCEDURAL[name].make(RNG(0))
-    for axis in (0, 1):
-        steps = np.abs(levels - np.roll(levels, 1, axis)).mean(axis=tuple({0, 1, levels.ndim - 1} - {axis}))
-        assert steps[0] <= np.quantile(steps, 0.99)
-
-
-@pytest.mark.slow
 def test_shadows_of_the_moon_fall_where_the_ground_is_in_the_way_of_the_sun():
     heights, brightness = textures.moon(RNG(0))
     size, cell = len(heights), textures.MOON_EXTENT / len(heights)
@@ -589,3 +544,24 @@ def test_shadows_of_the_moon_fall_where_the_ground_is_in_the_way_of_the_sun():
             lit.append(brightness[row, column])
     assert len(shaded) > 100 and max(shaded) <= 1.2 * 0.035 + 1e-6
     assert len(lit) > 2000 and np.median(lit) > 0.3
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"), [((5, 3), 8), ((64, 64), 64), ((65, 10), 128), ((20, 5000), 2048), ((1, 1), 1)]
+)
+def test_pictures_of_any_size_become_squares_that_show_the_same(tmp_path, shape, size):
+    width = shape[1]
+    ramp = np.broadcast_to(np.linspace(40, 200, width).round().astype(np.uint8), shape)
+    Image.fromarray(np.ascontiguousarray(ramp)).save(tmp_path / "picture.png")
+    scene, _ = load(write_scene(tmp_path, {"shape": "plane", "texture": "picture.png"}))
+    assert scene.channels == 1 and scene.texture_size.tolist() == [size]
+    image = scene.texels[: size**2, 0].reshape(size, size)
+    assert np.ptp(image, axis=0).max() < 1e-6
+    expected = [to_linear(value / 255) for value in ramp[0].tolist()]
+    places = (np.arange(size) + 0.5) / size * width - 0.5
+    if width <= size:
+        np.testing.assert_allclose(image[0], np.interp(places, np.arange(width), expected), atol=2e-3)
+    else:
+        edges = np.linspace(0, width, size + 1)
+        whole = np.interp(edges, np.arange(width + 1), np.append(0, np.cumsum(expected)))
+        np.testing.assert_allclose(image[0], np.diff(whole) * size / width, atol=2e-3)
