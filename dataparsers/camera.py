@@ -11,22 +11,23 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Shaped
 
 ROUND_TRIP_TOLERANCE = 1e-6
-"""Pixels between a pixel and the projection of its direction."""
+"""Most pixels between a pixel and the projection of its direction."""
 
 SHORTEST_FOCAL_LENGTH, LONGEST_FOCAL_LENGTH = 0.01, 1e4
-"""As a multiple of the width, or of the height: a view of 179 degrees, and one of 0.006."""
+"""Shortest and longest focal length, as a multiple of the width, or of the height: a view of 179 degrees, and one of
+0.006."""
 
 FARTHEST_PRINCIPAL_POINT = 10
-"""From the middle of the image, as a multiple of its width or height."""
+"""Farthest that the principal point may lie from the middle of the image, as a multiple of its width or height."""
 
 STEEPEST_DIRECTION = 1e4
-"""Largest x / z and y / z of where a pixel looks."""
+"""Largest x / z and y / z of the direction in which a pixel looks."""
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry by which the product of a rotation and its transpose may differ from one."""
 
 LARGEST_SIDE = 2**16 - 1
-"""Pixels; larger columns and rows do not fit the types that events are stored in."""
+"""Most pixels along a side of a camera; larger columns and rows do not fit the types that events are stored in."""
 
 COEFFICIENTS = {
     "pinhole": ((0,), "no coefficients"),
@@ -34,13 +35,15 @@ COEFFICIENTS = {
     "fisheye": ((4,), "finite numbers k1 k2 k3 k4"),
     "lookup": ((0,), "no coefficients"),
 }
-"""How many numbers the distortion of each model may have, and these in words."""
+"""How many numbers the distortion of each model may have, and the same in words."""
 
 CHECKED_STEP = 16
-"""Pixels between those at which a camera, when it is made, is checked to be a lens; its corners are among them."""
+"""Pixels from one to the next of those at which a camera, when it is made, is checked to be a lens; its corners are
+among them."""
 
 INVERSION_STEPS = 60
-"""Of a table of directions; each halves the error where the table is even, and lessens it up to fourfold stretching."""
+"""Steps in which a table of directions is inverted; each halves the error where the table is even, and lessens it up to
+fourfold stretching."""
 
 
 CameraModel = Literal["pinhole", "radtan", "fisheye", "lookup"]
@@ -56,20 +59,22 @@ class Camera:
     """
 
     width: int
-    """Pixels."""
+    """Width of the image, pixels."""
     height: int
-    """Pixels."""
+    """Height of the image, pixels."""
     fx: float
-    """Focal length in pixels."""
+    """Horizontal focal length in pixels; `fy` is the vertical one."""
     fy: float
     cx: float
-    """Principal point in pixels."""
+    """Column of the principal point in pixels; `cy` is its row."""
     cy: float
     distortion: tuple[float, ...] = ()
-    """radtan: k1, k2, p1, p2 and, if given, k3 (Brown-Conrady); fisheye: k1 to k4 (Kannala-Brandt)."""
+    """Coefficients of the distortion. radtan: k1, k2, p1, p2 and, if given, k3 (Brown-Conrady); fisheye: k1 to k4
+    (Kannala-Brandt)."""
     model: CameraModel = "pinhole"
     directions: Float64[np.ndarray, "height width 2"] | None = field(default=None, compare=False)
-    """For lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted camera."""
+    """For the model lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted
+    camera."""
 
     def __post_init__(self) -> None:
         if not all(0 < side <= LARGEST_SIDE and side == int(side) for side in (self.width, self.height)):

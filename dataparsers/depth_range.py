@@ -25,7 +25,7 @@ MIN_GAIN = 1.5  # relative to the plane at infinity
 MIN_VOTES = 0.1  # a grid pixel
 
 EVENTS_FOR_DEPTH = 4_000_000
-"""Of more events, so many measure the depth of the scene."""
+"""Number of events that measure the depth of the scene, where there are more."""
 
 
 def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -45,7 +45,7 @@ def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | N
 
 @cache
 def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
-    """Takes seconds, and is done once for a recording in a process."""
+    """Depth range measured from a recording's events; takes seconds, and is done once for a recording in a process."""
     events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
     try:
         return estimate_depth_range(events, recording.camera, recording.trajectory)

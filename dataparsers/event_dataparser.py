@@ -30,7 +30,7 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
 
 DEFAULT_HELD_OUT_EVERY = 4
-"""Of every so many frames one is held out."""
+"""Number of frames of which one is held out, where nothing else is set."""
 
 NUM_EVENT_PICTURES = 48
 """Cameras along the trajectory that stand in for frames where a recording has none."""
@@ -63,7 +63,7 @@ class EventDataParserConfig(DataParserConfig):
     format: Suppress[str] = "auto"
     """Name of a registered format, or auto to find out; what a sub-command stands for."""
     options: Annotated[FormatOptions, tyro.conf.arg(name="")] = FormatOptions()  # noqa: RUF009 - frozen
-    """Of the format. A default and no default_factory, so that runs of before there were any can be loaded."""
+    """Options of the format. A default and no default_factory, so that runs of before there were any can be loaded."""
 
 
 @dataclass

@@ -23,20 +23,20 @@ class EventIndex:
     """Events sorted by pixel, then time; 12 bytes an event. Pixel (x, y) of a sensor is number y * width + x."""
 
     times: Int64[Tensor, " events"]
-    """Nanoseconds; never decreasing within a pixel."""
+    """Time of each event, ns; never decreasing within a pixel."""
     positives: Int32[Tensor, " events"]
-    """Number of positive events up to and with this one, counted over the whole array: between two events i < j of one
-    pixel, (i, j] holds positives[j] - positives[i] positive ones, and the other j - i - that many are negative."""
+    """Number of positive events up to and with each event, counted over the whole array: between two events i < j of
+    one pixel, (i, j] holds positives[j] - positives[i] positive ones, and the other j - i - that many are negative."""
     offsets: Int64[Tensor, " pixels+1"]
-    """The events of pixel p are offsets[p] to offsets[p + 1] - 1."""
+    """Where the events of each pixel lie: those of pixel p are offsets[p] to offsets[p + 1] - 1."""
     width: int
-    """Of the sensor, pixels."""
+    """Width of the sensor, pixels."""
     hot_pixels: Int64[Tensor, " hot"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     """Numbers of the pixels whose events were left out."""
     notes: tuple[str, ...] = ()
     """What was left out of the recording's events, or could not be stored, one sentence each."""
     share_outside_poses: float = 0.0
-    """Of the recording's events, those that are left out because there are no poses."""
+    """Share of the recording's events that are left out because there are no poses."""
 
     def __len__(self) -> int:
         return len(self.times)
@@ -64,14 +64,14 @@ class EventIndex:
         return cls(torch.from_numpy(times), torch.from_numpy(positives), survey.offsets, width)
 
     def to(self, device: torch.device | str) -> EventIndex:
-        """The same index on another device."""
+        """The index on another device."""
         times, positives, offsets = (column.to(device) for column in (self.times, self.positives, self.offsets))
         hot_pixels = self.hot_pixels.to(device)
         return replace(self, times=times, positives=positives, offsets=offsets, hot_pixels=hot_pixels)
 
     @property
     def span(self) -> tuple[int, int]:
-        """First and last time, ns."""
+        """Times of the first and of the last event, ns."""
         active = self.offsets.diff() > 0
         first, last = self.offsets[:-1][active], self.offsets[1:][active] - 1
         return int(self.times[first].min()), int(self.times[last].max())
@@ -83,7 +83,7 @@ class EventIndex:
 
     @cached_property
     def _most_events(self) -> int:
-        """Of one pixel."""
+        """Largest number of events of one pixel."""
         return int(self.offsets.diff().max())
 
     def count_until(self, pixels: Int64[Tensor, "*batch"], times: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:

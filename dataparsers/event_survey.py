@@ -14,7 +14,7 @@ from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.recording import Events
 
 HOT_RATIO = 10
-"""A hot pixel fires more often than its neighbourhood's median by this factor; edges that pass stay far below."""
+"""Factor by which a hot pixel fires more often than its neighbourhood's median; edges that pass stay far below."""
 
 HOT_FLOOR = 5
 """Events that every neighbourhood is credited with, so that a few events in a plain region make no pixel hot."""
@@ -26,33 +26,34 @@ class Survey:
 
     width: int
     start: int
-    """Events before this time (ns) do not count."""
+    """First time (ns) whose events count."""
     end: int
-    """Nor do events after this one."""
+    """Last time (ns) whose events count."""
     counts: Int32[np.ndarray, " pixels"]
     """Events of each pixel from start to end."""
     num_events: int = 0
-    """Of the whole recording."""
+    """Number of events of the whole recording."""
     first: int = 0
     """Time of the first event of the recording, ns."""
     last: int = 0
-    """And of the last one."""
+    """Time of the last event of the recording, ns."""
     hot_pixels: Int64[np.ndarray, " hot"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Pixels that are left out, found by `leave_out_hot_pixels`; their counts are 0."""
+    """Numbers of the pixels that are left out, found by `leave_out_hot_pixels`; their counts are 0."""
     num_hot_events: int = 0
-    """Events of these."""
+    """Number of events of the hot pixels that are left out."""
     outside: int | None = None
-    """The first event outside the sensor; the survey ends there, as with the next two."""
+    """Number of the first event outside the sensor, at which the survey ends; None where there is none."""
     backwards: int | None = None
-    """The first event before its predecessor in time."""
+    """Number of the first event before its predecessor in time, at which the survey ends; None where there is none."""
     odd_polarity: int | None = None
-    """The first event of a polarity that is neither of the two that the recording uses."""
+    """Number of the first event of a polarity that is neither of the two that the recording uses, at which the survey
+    ends; None where there is none."""
     odd_event: tuple[int, int, int, int] = (0, 0, 0, 0)
     """x, y, t and p of the event at which the survey ended."""
 
     @property
     def offsets(self) -> Int64[Tensor, " pixels+1"]:
-        """Of an index of the events that count."""
+        """Offsets, as in `EventIndex`, of an index of the events that count."""
         offsets = np.zeros(len(self.counts) + 1, np.int64)
         np.cumsum(self.counts, out=offsets[1:])
         return torch.from_numpy(offsets)
@@ -70,7 +71,7 @@ class Survey:
 
 
 EventStream = Callable[[], Iterator[Events]]
-"""Starts again at the first event with every call, and gives the events in pieces."""
+"""Function that starts again at the first event with every call, and gives the events in pieces."""
 
 
 def survey_events(stream: EventStream, width: int, height: int, start: int, end: int) -> Survey:
@@ -143,7 +144,7 @@ def sorted_bands(
 
 
 def _narrow(column: Int[np.ndarray, " events"]) -> np.ndarray:
-    """As int32, so that the compiled loops meet one type; what is too large stays too large."""
+    """A column as int32, so that the compiled loops meet one type; what is too large stays too large."""
     if column.dtype.itemsize < 4 or column.dtype == np.int32:
         return column.astype(np.int32, copy=False)
     limits = np.iinfo(np.int32)

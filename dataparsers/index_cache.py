@@ -24,10 +24,10 @@ from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
 
 LAYOUT = 2
-"""Counted up when what is stored changes."""
+"""Version of what is stored in an entry, counted up when that changes."""
 
 CACHED_FROM = 2_000_000
-"""Fewer events are sorted again each time, which takes less than a second."""
+"""Number of events from which an index is stored; fewer are sorted again each time, which takes less than a second."""
 
 COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
 
@@ -35,7 +35,7 @@ CHECKED_BLOCKS, BLOCK = 64, 2**16
 """Blocks of each file, and bytes of each block, whose checksum is compared when an entry is used."""
 
 STALE_SECONDS = 86400
-"""Age from which what an interrupted process has left behind is removed."""
+"""Age in seconds from which what an interrupted process has left behind is removed."""
 
 
 def cache_folder() -> Path:
@@ -162,7 +162,7 @@ def _checksum(path: Path) -> list[int]:
 
 
 def _physical_memory() -> int:
-    """Bytes; of a system that does not tell, 8 GiB."""
+    """Memory of the machine in bytes; of a system that does not tell, 8 GiB."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

@@ -19,7 +19,7 @@ LARGEST_RATE = 2e9
 """Events per second that no sensor can send; more of them means that times are in another unit than was thought."""
 
 SILENT_SECONDS = 2.0
-"""How long indexing goes on before a progress bar is shown."""
+"""Seconds that indexing goes on before a progress bar is shown."""
 
 
 @cache
@@ -128,7 +128,7 @@ def _check(recording: EventRecording, survey: Survey) -> None:
 
 
 def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
-    """The same events; a progress bar shows how many of them have passed, once that takes long.
+    """The events of a stream; a progress bar shows how many of them have passed, once that takes long.
 
     Args:
         stream: To be called several times.

@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NUM_INSTANTS = 6
-"""At which events are shown, beside the frames of the same times."""
+"""Number of instants at which events are shown, beside the frames of the same times."""
 NUM_FRUSTA = 16
-"""Cameras drawn along the trajectory."""
+"""Number of cameras drawn along the trajectory."""
 PICTURE_WIDTH = 640
-"""Pixels of a picture on the page, at most."""
+"""Most pixels across a picture on the page."""
 NAMED_HOT_PIXELS = 8
-"""Listed one by one; the heat map marks all."""
+"""Number of hot pixels that are listed one by one; the heat map marks all."""
 
 BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
 
@@ -55,10 +55,10 @@ class Instant:
     """What the page shows of one time; pictures as data URIs."""
 
     time: str
-    """Seconds, with their unit."""
+    """Time in seconds, with their unit."""
     events: str
     frame: str | None = None
-    """None where there are events alone."""
+    """Frame of this time as a data URI; None where there are events alone."""
     frame_name: str = ""
 
 
@@ -69,7 +69,7 @@ class Inspection:
     recording: EventRecording
     statistics: EventStatistics
     depth_range: tuple[float, float] | None
-    """Metres; None where it is neither stated nor can be measured."""
+    """Nearest and farthest depth of the scene, metres; None where it is neither stated nor can be measured."""
     problems: list[Problem]
 
     @classmethod
@@ -333,7 +333,7 @@ def problems_table(problems: list[Problem]) -> Table | str:
 
 
 def _round(number: float) -> str:
-    """To three digits."""
+    """A number as text, rounded to three digits."""
     return f"{float(f'{number:.3g}'):,.0f}"
 
 

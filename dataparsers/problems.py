@@ -19,80 +19,84 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 MAX_BINS = 1000
-"""Of the event rate: more are not told apart on a screen."""
+"""Most bins of the event rate: more are not told apart on a screen."""
 
 EVENTS_PER_BIN = 200
-"""On average at least; so many random events never leave a bin empty."""
+"""Fewest events in a bin of the event rate on average; so many random events never leave a bin empty."""
 
 SAMPLED_EVENTS = 2**22
-"""Looked at to find problems, evenly taken, so that a training of a large recording does not wait."""
+"""Events looked at to find problems, evenly taken, so that a training of a large recording does not wait."""
 
 EVENTS_AT_ONCE = 2**24
-"""Whose times are held in memory while they are counted."""
+"""Events whose times are held in memory while they are counted."""
 
 MAX_SHARE_OUTSIDE = 0.05
-"""Of events or frames without poses; a camera that starts a moment before the tracker loses less."""
+"""Largest share of events or frames without poses; a camera that starts a moment before the tracker loses less."""
 
 GAP_RATIO = 10
-"""A gap between poses is longer than the median interval by this; the spline guesses within it."""
+"""Factor by which a gap between poses is longer than the median interval; the spline guesses within it."""
 
 MIN_GAP = 0.1
-"""Seconds. A hand turns the camera by many degrees within a gap of this length."""
+"""Shortest gap between poses, seconds. A hand turns the camera by many degrees within a gap of this length."""
 
 MAX_TURN = 5.0
-"""Degrees between two poses. A hand's angular acceleration of 1000 degrees/s² at 20 poses a second turns the camera by
-2.5 degrees between poses, of which interpolation gets 0.3 wrong: a few pixels."""
+"""Most degrees that the camera may turn between two poses. A hand's angular acceleration of 1000 degrees/s² at 20 poses
+a second turns the camera by 2.5 degrees between poses, of which interpolation gets 0.3 wrong: a few pixels."""
 
 JUMP_RATIO = 5
-"""A jump between two poses is faster than its neighbourhood's median by this; the noise of a tracker stays below 3."""
+"""Factor by which a jump between two poses is faster than its neighbourhood's median; the noise of a tracker stays
+below 3."""
 
 JUMP_NEIGHBOURHOOD = 11
 """Steps between poses whose median speed a jump is compared to: more than twice the two steps of one wrong pose."""
 
 MIN_JUMP = 5.0
-"""Pixels by which the picture moves too far; smaller jumps are blurred, but do not double edges."""
+"""Least pixels by which the picture moves too far in a jump between two poses; smaller jumps are blurred, but do not
+double edges."""
 
 MOVING = 0.3
-"""The camera moves when the picture does at this share of its speed at a fast moment (90th percentile)."""
+"""Share of the picture's speed at a fast moment (90th percentile) above which the camera is said to move."""
 
 DROPOUT_RATIO = 0.02
-"""The sensor is silent below this share of the usual event rate; noise alone makes some per cent in dim light."""
+"""Share of the usual event rate below which the sensor is silent; noise alone makes some per cent in dim light."""
 
 MIN_SILENT_MOTION = 5.0
-"""Pixels that the picture moves during a silence. Where the camera turns back, edges pass twice before pixels fire."""
+"""Least pixels that the picture moves during a silence. Where the camera turns back, edges pass twice before pixels
+fire."""
 
 BURST_RATIO = 20
-"""A burst exceeds the usual event rate by this, beyond what the speed of the camera explains."""
+"""Factor by which a burst exceeds the usual event rate, beyond what the speed of the camera explains."""
 
 MAX_POLARITY_RATIO = 3.0
-"""Between on and off events. Sensors are set up for equal thresholds; those delivered stay below 2."""
+"""Largest ratio between on and off events. Sensors are set up for equal thresholds; those delivered stay below 2."""
 
 MAX_SHARE_BELOW_TWO = 0.5
-"""Of pixels with fewer than two events, which make no pair to learn from."""
+"""Largest share of pixels with fewer than two events, which make no pair to learn from."""
 
 MIN_EVENTS_PER_PIXEL = 10
-"""On average: a few grey levels' worth of change; recordings that the method was shown on have dozens."""
+"""Fewest events of a pixel on average: a few grey levels' worth of change; recordings that the method was shown on have
+dozens."""
 
 MAX_SHARE_HOT = 0.001
-"""Of pixels; a healthy sensor has a handful."""
+"""Largest share of pixels that are hot; a healthy sensor has a handful."""
 
 MIN_FRAMES = 8
-"""Of which, with every fourth held out, six are left to learn from and two to score."""
+"""Fewest frames, of which, with every fourth held out, six are left to learn from and two to score."""
 
 MAX_SHARE_DROPPED_FRAMES = 0.05
-"""Of frames missing in a regular sequence; more of them point at wrong stamps."""
+"""Largest share of frames missing in a regular sequence; more of them point at wrong stamps."""
 
 MIN_PARALLAX = 5.0
-"""Pixels by which the nearest point moves against the farthest, of the events' camera: less is lost in blur."""
+"""Least pixels of the events' camera by which the nearest point moves against the farthest: less is lost in blur."""
 
 ASSUMED_NEAREST = 0.5
-"""Metres, where the recording does not state how near the scene is."""
+"""Nearest depth that is assumed, metres, where the recording does not state how near the scene is."""
 
 MAX_EXTENT = 100.0
-"""Metres that the path of a camera spans; a hand-held path in millimetres spans hundreds."""
+"""Most metres that the path of a camera spans; a hand-held path in millimetres spans hundreds."""
 
 MAX_DEPTH_RATIO = 100.0
-"""Between farthest and nearest depth; samples along rays are spread over all of it."""
+"""Largest ratio between farthest and nearest depth; samples along rays are spread over all of it."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +114,9 @@ class EventStatistics:
     """The events of a recording in numbers; hot pixels that are left out are not counted."""
 
     edges: Int64[np.ndarray, " bins+1"]
-    """Of the bins of time, ns; from the first event to the last."""
+    """Edges of the bins of time, ns; from the first event to the last."""
     rate: Float64[np.ndarray, " bins"]
-    """Events per second."""
+    """Events per second in each bin of time."""
     counts: Int64[np.ndarray, "height width"]
     """Events of each pixel."""
     num_on: int
@@ -125,12 +129,12 @@ class EventStatistics:
 
     @property
     def seconds(self) -> float:
-        """From the first event to the last, at least a nanosecond."""
+        """Seconds from the first event to the last, at least a nanosecond."""
         return max(int(self.edges[-1] - self.edges[0]), 1) * 1e-9
 
     @property
     def share_below_two(self) -> float:
-        """Of all pixels, those with fewer than two events."""
+        """Share of all pixels that have fewer than two events."""
         return float((self.counts < 2).mean())
 
     @property

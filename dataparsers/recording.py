@@ -21,13 +21,14 @@ EVENTS_AT_A_TIME = 2**18
 """Events that readers hand on at once: enough for speed, few enough to need hardly any memory."""
 
 LARGEST_SPAN_RATIO = 300
-"""Between the spans of events or frames and poses; units of time differ by 1000."""
+"""Largest ratio between the spans of events or frames and poses; units of time differ by 1000."""
 
 LONGEST_REFRACTORY_PERIOD = 10**12
-"""Nanoseconds."""
+"""Longest refractory period, nanoseconds."""
 
 SHORTEST_FRAME_STEP = 1_000_000
-"""Nanoseconds; frames closer together than this are in another unit if they also span hardly any of the poses."""
+"""Shortest time from frame to frame, nanoseconds; frames closer together than this are in another unit if they also
+span hardly any of the poses."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class Events:
     """Brightness changes in time order, one array a column."""
 
     x: Int[np.ndarray, " events"]
-    """Columns, of any integer type."""
+    """Columns of the pixels, of any integer type."""
     y: Int[np.ndarray, " events"]
-    """Rows, of any integer type."""
+    """Rows of the pixels, of any integer type."""
     t: Int64[np.ndarray, " events"]
-    """Nanoseconds, never decreasing."""
+    """Times in nanoseconds, never decreasing."""
     p: Int[np.ndarray, " events"]
-    """Polarity: 1 where it became brighter; where it became darker, -1, or 0 or false as some formats write."""
+    """Polarities: 1 where it became brighter; where it became darker, -1, or 0 or false as some formats write."""
 
     def __len__(self) -> int:
         return len(self.t)
@@ -53,14 +54,15 @@ class Frames:
 
     filenames: tuple[Path, ...]
     times: Int64[np.ndarray, " frames"]
-    """Nanoseconds, strictly increasing: the middle of the exposure."""
+    """Times in nanoseconds, strictly increasing: the middle of each exposure."""
     camera: Camera
     trajectory: Trajectory
-    """Of the camera of the frames."""
+    """Trajectory of the camera of the frames."""
     depth_filenames: tuple[Path, ...] | None = None
-    """.npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was hit."""
+    """Depth maps, .npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was
+    hit."""
     numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Of each frame in its folder, from 0; counted here unless given."""
+    """Number of each frame in its folder, from 0; counted here unless given."""
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -90,11 +92,11 @@ class EventRecording:
 
     path: Path
     format: str
-    """Name of the format, of `enerf_ns.dataparsers.formats.registry`."""
+    """Name of the format, one of `enerf_ns.dataparsers.formats.registry`."""
     camera: Camera
-    """Of the events."""
+    """Camera of the events."""
     trajectory: Trajectory
-    """Of the event camera."""
+    """Trajectory of the event camera."""
     stream_events: Callable[[], Iterator[Events]]
     """Reads the events as they are in the files, in pieces of at most about `EVENTS_AT_A_TIME`. Every call starts again
     and gives the same events, whatever a file has grown by since the reader looked at it."""
@@ -103,11 +105,11 @@ class EventRecording:
     frames: Frames | None = None
     """Sharp frames."""
     blurred_frames: Frames | None = None
-    """The same instants, blurred by motion."""
+    """Frames at the same instants as the sharp ones, blurred by motion."""
     held_out_frames: Frames | None = None
     """Views for evaluation alone, on a trajectory and a clock of their own."""
     contrast_thresholds: tuple[float, float] | None = None
-    """Of on and of off events, above 0, where the recording knows them."""
+    """Contrast thresholds of on and of off events, above 0, where the recording knows them."""
     refractory_period: int = 0
     """For how long a pixel is blind after an event, ns; at most 1000 s."""
     bayer_pattern: str | None = None
@@ -120,11 +122,11 @@ class EventRecording:
     notes: tuple[str, ...] = ()
     """What was dropped or renormalised, one sentence each; what is said of the events is with their index."""
     shares_outside_poses: dict[str, float] = field(default_factory=dict)
-    """Of "frames" and "blurred frames", the share that is left out, where it is above 0."""
+    """Share that is left out of "frames" and of "blurred frames" for lack of poses, where it is above 0."""
     locate_event: Callable[[int], str] | None = None
     """File and line of event number i of the stream, for error messages."""
     num_events: int | None = None
-    """In the files, where that is known before they are read; for progress alone."""
+    """Number of events in the files, where that is known before they are read; for progress alone."""
     time_range: tuple[int, int] | None = None
     """First and last time (ns) of what is used of the recording."""
     keep_hot_pixels: bool = False
@@ -241,7 +243,7 @@ class EventRecording:
 
 
 def _is_response(name: object) -> bool:
-    """Whether it has the form of a response's name, whatever offsets a sensor allows."""
+    """Whether a text has the form of a response's name, whatever offsets a sensor allows."""
     if name == "linlog":
         return True
     kind, _, offset = name.partition(":") if isinstance(name, str) else ("", "", "")

@@ -47,7 +47,7 @@ class MethodDefaults:
 DEFAULT_SILENCE_MS = 20.0
 
 LARGEST_RESOLUTION = 4096
-"""Cells along the box of the finest level that is chosen."""
+"""Most cells along the box that are chosen for the finest level of the hash grid."""
 
 
 class PipelineConfig(Protocol):
@@ -76,9 +76,9 @@ class Resolution:
     """What is used where a config leaves it open, and all choices; empty before anything was resolved."""
 
     values: dict[str, Any] = field(default_factory=dict)
-    """By the name of the setting within the config of the pipeline, such as model.num_channels."""
+    """What is used, by the name of the setting within the config of the pipeline, such as model.num_channels."""
     choices: tuple[Choice, ...] = ()
-    """A row for each part of the method."""
+    """What was chosen and why, a row for each part of the method."""
     selection: tuple[str, ...] = ()
     """What there is to say about the preset, one sentence each."""
 

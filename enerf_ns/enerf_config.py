@@ -23,9 +23,9 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Adam with the settings of instant neural graphics primitives, all parameters in one kernel."""
 
     betas: Tuple[float, float] = (0.9, 0.99)  # noqa: UP006
-    """Decay of the running means."""
+    """Decay of Adam's running means."""
     fused: bool = True
-    """One kernel for the whole step; on a hash grid several times faster than the loop."""
+    """Take the whole step in one kernel; on a hash grid several times faster than the loop."""
 
 
 @dataclass

@@ -97,7 +97,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @property
     def recording(self) -> EventRecording:
-        """What is learnt from."""
+        """The recording that is learnt from."""
         return self.train_dataset.recording
 
     @cached_property

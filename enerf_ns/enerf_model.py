@@ -38,17 +38,17 @@ class EnerfModelConfig(ModelConfig):
     num_levels: int = 10
     """Levels of the hash grid."""
     base_res: int = 16
-    """Cells along the box at the coarsest level."""
+    """Cells along the box at the coarsest level of the hash grid."""
     max_res: Optional[int] = None  # noqa: UP045
-    """Cells along the box at the finest level. None: as fine as the sensor's pixels on the scene."""
+    """Cells along the box at the finest level of the hash grid. None: as fine as the sensor's pixels on the scene."""
     log2_table_size: int = 17
-    """Base-2 logarithm of the entries of each level."""
+    """Base-2 logarithm of the entries of each level of the hash grid."""
     hidden_dim: int = 32
     """Width of the density network."""
     hidden_dim_colour: Annotated[int, tyro.conf.arg(aliases=["--pipeline.model.hidden-dim-color"])] = 32
     """Width of the colour network."""
     num_features: int = 15
-    """What the density network tells the colour network."""
+    """Numbers that the density network tells the colour network."""
     view_direction: bool = False
     """Let colour depend on the viewing direction: for shiny scenes that are seen from many sides."""
     brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
@@ -56,7 +56,7 @@ class EnerfModelConfig(ModelConfig):
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
     sampling: Literal["proposal", "uniform"] = "proposal"
-    """Samples along a ray: where a small network expects surfaces, or everywhere."""
+    """Where samples along a ray lie: where a small network expects surfaces, or everywhere."""
     num_proposal_samples: int = 48
     """Samples of the proposal network along a ray."""
     num_samples: int = 24

@@ -73,7 +73,7 @@ class EnerfPipeline(VanillaPipeline):
         return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-        """As `get_train_loss_dict`, rendered as in evaluation."""
+        """Outputs, losses and metrics of the next batch, as of `get_train_loss_dict` but rendered as in evaluation."""
         self.eval()
         with torch.no_grad():
             results = self.get_train_loss_dict(step)
@@ -101,7 +101,7 @@ class EnerfPipeline(VanillaPipeline):
     ) -> dict[str, Any]:
         """Mean scores over the held-out frames: psnr, ssim, correlation, and lpips and depth_rmse where available.
 
-        Of a recording without frames, the correlation of its events alone.
+        For a recording without frames, only the correlation of its events.
 
         Args:
             step: Ignored; Nerfstudio passes it.

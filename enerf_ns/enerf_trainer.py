@@ -59,7 +59,7 @@ class EnerfTrainerConfig(TrainerConfig):
         return config
 
     def recording(self) -> EventRecording:
-        """What is learnt from, of a config that is resolved."""
+        """The recording that is learnt from, of a config that is resolved."""
         return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
 
     def save_config(self) -> None:

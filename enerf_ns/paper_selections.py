@@ -34,17 +34,18 @@ class Preset:
     the first and the last; or those that follow it, up to the next train frame, and after the last up to the next frame
     of the recording."""
     event_pairs: int
-    """Event pairs of a step."""
+    """Event pairs drawn at each step."""
     frame_rays: int
-    """Frame pixels of a step."""
+    """Frame pixels drawn at each step."""
     contrast_thresholds: tuple[float, float] | None
-    """C_on and C_off. None: unknown, and the normalised event loss, which does not need them."""
+    """Contrast thresholds C_on and C_off. None: they are unknown, and the loss is the normalised event loss, which does
+    not need them."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """In network units."""
+    """Place of the origin of the recording's world in the network, in network units."""
     silent_pairs: int = 0
-    """Silent pairs of a step: half as many as event pairs, or none where the no-event loss is off."""
+    """Silent pairs drawn at each step: half as many as event pairs, or none where the no-event loss is off."""
     silence_ms: float = 20.0
-    """No-event interval: shortest silence of a pixel that counts."""
+    """No-event interval: shortest silence of a pixel that counts, ms."""
     no_event_weight: float = 1.0
     """The paper's weight of the no-event loss, whose brightness changes are not counted in thresholds."""
     mended: tuple[str, ...] = ()
@@ -273,7 +274,7 @@ PRESETS: dict[str, Preset] = {
         contrast_thresholds=(0.2, 0.2),
     ),
 }
-"""By the names of the data sets' sequences."""
+"""Presets by the names of the data sets' sequences."""
 
 
 def event_time_range(

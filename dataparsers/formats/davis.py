@@ -40,7 +40,7 @@ def read(folder: Path) -> EventRecording:
     The recording's zero of time is the earliest first stamp among events, frames and poses.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, or anything in it cannot be used.

@@ -56,10 +56,10 @@ CLOCK_START = 1000 * 10**9
 """What the clock of a recording that is written shows (ns) when the simulation's is at 0."""
 
 OFFSET_TOLERANCE = 2000
-"""ns by which the preparation may round a time."""
+"""Nanoseconds by which the preparation may round a time."""
 
 KALIBR_MODELS: dict[str, CameraModel] = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
-"""Kalibr's names of the distortion models, and ours."""
+"""This package's names of the distortion models, by Kalibr's."""
 
 PUBLISHED_RGB_CAMERA = Camera(
     *SENSOR_SIZE,
@@ -81,10 +81,11 @@ PUBLISHED_EXTRINSICS = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-"""Pose of the RGB camera in the axes of the event camera; these three are EDS's calibration, for when none is there."""
+"""Pose of the RGB camera in the axes of the event camera; with the two published cameras, EDS's calibration, for when
+none is there."""
 
 Poses = tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]
-"""Times (ns), positions and quaternions."""
+"""Times (ns), positions and quaternions of poses."""
 
 
 def read(folder: Path) -> EventRecording:
@@ -94,7 +95,7 @@ def read(folder: Path) -> EventRecording:
     files as prepared.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, anything in it cannot be used, or the files share no clock.
@@ -219,7 +220,7 @@ def _read_image_list(
 
 
 def _overlap(events: Hdf5Events, times: Int64[np.ndarray, " rows"]) -> int:
-    """For how many ns there are both; below 0, how far they are apart."""
+    """For how many ns there are both events and these times; below 0, how far they are apart."""
     return int(min(times[-1], events.last_time) - max(times[0], events.first_time))
 
 
@@ -332,7 +333,7 @@ def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...
 
 
 def _read_undistorted_camera(folder: Path, number: int) -> Camera:
-    """Of the RGB (0) or the event camera (1) after the preparation."""
+    """RGB (0) or event camera (1) after the preparation."""
     path = folder / "calib_undist_calib0.json"
     entries = read_json(path).get("intrinsics_undistorted")
     try:
@@ -349,14 +350,17 @@ def _read_undistorted_camera(folder: Path, number: int) -> Camera:
 
 
 class EdsWriter(Writer):
-    """EDS as it is unpacked. The published files do not state exposures; simulation.json does."""
+    """Writer of EDS as it is unpacked. The published files do not state exposures; simulation.json does."""
 
     layout = "eds"
     start = CLOCK_START
     published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA, PUBLISHED_EXTRINSICS)
 
     def add_events(self, events: Events) -> None:
-        """As of `Writer.add_events`, up to 1 µs before the last frame, since E-NeRF's loader wants that to be last."""
+        """Adds events up to 1 µs before the last frame, since E-NeRF's loader wants that to be last.
+
+        Else as `Writer.add_events`.
+        """
         until = int(np.searchsorted(events.t, self.setup.frame_times[-1] - 1000))
         super().add_events(Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until]))
 

@@ -34,14 +34,14 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
 
 FEWEST_POSES = 101
-"""That the reference code of E-NeRF accepts."""
+"""Fewest poses that the reference code of E-NeRF accepts."""
 
 
 def read(folder: Path) -> EventRecording:
     """Reads all but the events, which are read when asked for.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, or anything in it cannot be used.
@@ -169,7 +169,7 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
 
 
 class EsimWriter(Writer):
-    """E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
+    """Writer of E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
 
     layout = "esim"
     fewest_frames = 11

@@ -59,7 +59,7 @@ DEFAULT_FLAGS = {
     "refractory_period_ns": "0",
     COLOUR: "false",
 }
-"""Of the simulator; what esim.conf does not state is this."""
+"""Default flags of the simulator; what esim.conf does not state is this."""
 
 TRUTH = {**dict.fromkeys(("1", "t", "true", "y", "yes"), True), **dict.fromkeys(("0", "f", "false", "n", "no"), False)}
 
@@ -68,7 +68,7 @@ def read(folder: Path) -> EventRecording:
     """Reads all but the events, which are read when asked for.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, anything in it cannot be used, or rosbags is not installed.

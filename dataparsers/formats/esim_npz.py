@@ -54,7 +54,7 @@ def read(folder: Path) -> EventRecording:
     """Reads all but the events, which are read when asked for.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, or anything in it cannot be used.
@@ -119,11 +119,11 @@ class _StoredArray:
         return self.shape[0]
 
     def rows(self, count: int) -> np.ndarray:
-        """The next ones."""
+        """The next rows."""
         return self._numbers((count, *self.shape[1:]))
 
     def whole(self) -> np.ndarray:
-        """All of it, at once."""
+        """The whole array, at once."""
         return self._numbers(self.shape)
 
     def close(self) -> None:

@@ -25,18 +25,19 @@ from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.recording import Events
 
 BYTES_AT_A_TIME = 2**18
-"""Read at once; a vector word of two bytes may hold twelve events."""
+"""Bytes that are read at once; a vector word of two bytes may hold twelve events."""
 
 LARGEST_HEADER = 2**16
 """Bytes within which the text at the start of a .raw or .dat file ends."""
 
 AEDAT4_MAGIC = b"#!AER-DAT4.0\r\n"
 DAT_EVENT_TYPES = (0x00, 0x0C)
-"""Of contrast detection; they have one layout."""
+"""Types of DAT files with events of contrast detection; they have one layout."""
 
 EVT2_TYPES = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 EVT3_TYPES = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
-"""Kinds of words that exist; others show that a file is damaged or of another encoding."""
+"""Kinds of words that exist in EVT3, as `EVT2_TYPES` in EVT2; others show that a file is damaged or of another
+encoding."""
 
 WORD_BYTES = {"EVT2": 4, "EVT2.1": 8, "EVT3": 2, "DAT": 8}
 
@@ -47,14 +48,14 @@ class EventFile:
 
     path: Path
     encoding: str
-    """EVT2, EVT2.1, EVT3, DAT or AEDAT4."""
+    """Encoding of the file: EVT2, EVT2.1, EVT3, DAT or AEDAT4."""
     size: tuple[int, int] | None
     """Width and height of the sensor in pixels, where the file states them."""
     start: int
     """Time of the first event on the file's clock, ns."""
     stream: Callable[[], Iterator[Events]]
-    """Every call gives all events anew, in pieces and as they are in the file: polarity {0, 1}, times in ns from the
-    first event. Raises RecordingError where the file is damaged."""
+    """Function of which every call gives all events anew, in pieces and as they are in the file: polarity {0, 1}, times
+    in ns from the first event. Raises RecordingError where the file is damaged."""
 
 
 def open_event_file(path: Path) -> EventFile:
@@ -96,7 +97,7 @@ def open_event_file(path: Path) -> EventFile:
 
 
 EventStream = Callable[[], Iterator[Events]]
-"""Here with times in microseconds on the file's clock."""
+"""Function that gives the events in pieces, with times in microseconds on the file's clock."""
 
 
 def _open_prophesee(path: Path, begin: bytes, num_bytes: int) -> tuple[str, tuple[int, int] | None, EventStream]:
@@ -202,7 +203,7 @@ class _Clock:
         self.period, self.last, self.passed = period, 0, 0
 
     def unwrap(self, times: Int64[np.ndarray, " words"]) -> Int64[np.ndarray, " words"]:
-        """The same times, going on where the counter began again."""
+        """Times that go on where the counter of the given ones began again."""
         if not len(times):
             return times
         periods = self.passed + np.cumsum(np.diff(times, prepend=self.last) < -self.period // 2)
@@ -211,7 +212,7 @@ class _Clock:
 
 
 def _decode_dat(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """Bits 0 to 31 time in microseconds, 32 to 45 x, 46 to 59 y, 60 to 63 polarity."""
+    """Events of DAT words: bits 0 to 31 time in microseconds, 32 to 45 x, 46 to 59 y, 60 to 63 polarity."""
     clock = _Clock(2**32)
     for words in pieces:
         address = (words >> np.uint64(32)).astype(np.int64)
@@ -220,7 +221,7 @@ def _decode_dat(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 
 
 def _decode_evt2(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """Bits 28 to 31 type; of an event 22 to 27 lowest bits of time, 11 to 21 x, 0 to 10 y."""
+    """Events of EVT2 words: bits 28 to 31 type; of an event 22 to 27 lowest bits of time, 11 to 21 x, 0 to 10 y."""
     clock, high = _Clock(2**28), -1
     for words in pieces:
         kinds = words >> 28
@@ -232,7 +233,8 @@ def _decode_evt2(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 
 
 def _decode_evt21(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """The upper 32 bits as of EVT2; the lower ones tell which of the 32 pixels from x on have fired."""
+    """Events of EVT2.1 words: the upper 32 bits as of EVT2; the lower ones tell which of the 32 pixels from x on have
+    fired."""
     clock, high = _Clock(2**28), -1
     for pair in pieces:
         words = (pair >> np.uint64(32)).astype(np.int64)

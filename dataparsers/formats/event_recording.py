@@ -59,7 +59,7 @@ OPTIONAL_KEYS = (
 STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
 LATEST = 2**62
-"""Times must be smaller than this many ns, 146 years, so that differences of two never overflow."""
+"""Time in ns, 146 years, that all times must stay below, so that differences of two never overflow."""
 
 MOUNTING_TOLERANCE = 1e-6
 """Metres, and entries of a rotation, by which a camera may move against the one that it is fixed to."""
@@ -69,7 +69,7 @@ def read(folder: Path) -> EventRecording:
     """Reads all but the events, which are read when asked for.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
 
     Raises:
         RecordingError: A file is missing or empty, or anything in it cannot be used.
@@ -437,7 +437,7 @@ def _list(names: tuple[str, ...] | list[str]) -> str:
 
 
 class EventRecordingWriter(Writer):
-    """This project's own layout."""
+    """Writer of this project's own layout."""
 
     layout = "event_recording"
 
@@ -482,7 +482,7 @@ class EventRecordingWriter(Writer):
 
 
 class _ColumnFiles:
-    """x.npy, y.npy, t.npy and p.npy."""
+    """The files x.npy, y.npy, t.npy and p.npy of a recording that is written."""
 
     def __init__(self, folder: Path):
         self._files = {name: GrowingArray(folder / f"{name}.npy", dtype) for name, dtype in STORED_TYPES.items()}

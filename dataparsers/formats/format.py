@@ -23,16 +23,16 @@ class Format:
     """A layout of recordings in folders."""
 
     name: str
-    """Such as tum_vie."""
+    """Name of the format, such as tum_vie."""
     command: str
     """Sub-command of the data parser, such as tumvie-events."""
     description: str
-    """One sentence, for the help of that."""
+    """One sentence about the format, for the help of its sub-command."""
     files: tuple[str, ...]
     """Patterns (glob) of files that tell a folder of this format from those of others."""
     read: Callable[..., EventRecording]
     """Reads all but the events from a folder (Path), with the options by name; raises RecordingError."""
     options: type[FormatOptions] = FormatOptions
-    """Of `read`."""
+    """Class of the options that `read` takes."""
     writer: type[Writer] | None = None
-    """What writes such a folder; None where it can only be read."""
+    """Class that writes such a folder; None where it can only be read."""

@@ -29,16 +29,17 @@ if TYPE_CHECKING:
 COLUMNS = ("x", "y", "t", "p")
 
 LATEST = 2**62 // 1000
-"""µs; what lies beyond (146 years) does not fit into 64 bits of nanoseconds, or is no µs."""
+"""Time in µs; what lies beyond (146 years) does not fit into 64 bits of nanoseconds, or is no µs."""
 
 BLOSC_FILTERS, BLOSC_PARAMETERS = (32001, 32026), 4
-"""Blosc and Blosc2, which end the process where they find fewer parameters in a damaged file."""
+"""Filters Blosc and Blosc2, and how many parameters they have at least; they end the process where they find fewer in a
+damaged file."""
 
 METADATA_BYTES = 2**17
-"""By which a file that is written may grow beside its events at a time."""
+"""Bytes by which a file that is written may grow beside its events at a time."""
 
 SMALLEST_CACHE = 2**20
-"""Bytes for chunks that were decompressed and are not yet used up."""
+"""Least bytes of cache for chunks that were decompressed and are not yet used up."""
 
 
 class Hdf5Events:
@@ -54,11 +55,11 @@ class Hdf5Events:
 
     path: Path
     num_events: int
-    """When the file was looked at; what is appended later does not count."""
+    """Number of events when the file was looked at; what is appended later does not count."""
     first_time: int
-    """ns, on the clock of the file."""
+    """Time of the first event, ns on the clock of the file."""
     last_time: int
-    """ns, on the clock of the file."""
+    """Time of the last event, ns on the clock of the file."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -151,7 +152,7 @@ class Hdf5Events:
         return int(offset.reshape(()))
 
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
-        """Nanoseconds from `zero`."""
+        """Times of some events, nanoseconds from `zero`."""
         times = column[start:stop]
         extremes = (int(times.min()) + self._offset, int(times.max()) + self._offset) if len(times) else ()
         if any(abs(time) >= LATEST for time in extremes):
@@ -223,7 +224,9 @@ def _chunk_bytes(dataset: h5py.Dataset) -> int:
 
 
 class Hdf5EventsFile:
-    """x, y, t (whole microseconds) and p (0 or 1); if in a group, also ms_to_idx: each millisecond's first event.
+    """An HDF5 file of events that grows: x, y, t (whole microseconds) and p (0 or 1).
+
+    If they are in a group, there is also ms_to_idx: each millisecond's first event.
 
     Only whole chunks are added until the file is closed, since one that is rewritten as it grows may end up in place
     of another that the file on the disk still refers to. The room that an addition needs is taken from the disk before

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from enerf_ns.dataparsers.errors import RecordingError
 
 LONGEST = 60
-"""Letters of a value that an error shows."""
+"""Most letters of a value that an error shows."""
 
 
 def parse_numbers(
@@ -27,7 +27,7 @@ def parse_numbers(
         expected: In words, such as "two numbers".
 
     Raises:
-        RecordingError: It is something else.
+        RecordingError: The value is something else.
     """
     try:
         return parse_array(value, shape)
@@ -39,7 +39,7 @@ def parse_array(value: object, shape: tuple[int, ...]) -> Float64[np.ndarray, ".
     """Finite numbers of this shape from nested lists.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The value is something else.
     """
     array = np.array(value, dtype=object)
     if array.shape != shape or not all(type(number) in (int, float) for number in array.flat):

@@ -28,7 +28,7 @@ def register(format: Format) -> None:
         format: Its name and its command are those of no other.
 
     Raises:
-        ValueError: They are.
+        ValueError: There is a format of this name or command already.
     """
     taken = {name for known in formats() for name in (known.name, known.command)}
     if format.name in taken or format.command in taken or format.name == "auto":

@@ -21,21 +21,22 @@ from enerf_ns.dataparsers.recording import Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 SHORTEST_STEP = 1000
-"""Nanoseconds between poses. ESIM states poses at the times of its inertial sensor and of its images, which may all but
-coincide; as stamps are whole nanoseconds, the speed between two such poses would be anything, and the spline follow."""
+"""Least nanoseconds between poses. ESIM states poses at the times of its inertial sensor and of its images, which may
+all but coincide; as stamps are whole nanoseconds, the speed between two such poses would be anything, and the spline
+follow."""
 
 LATEST = 2**62
-"""Nanoseconds, 146 years; what lies beyond is no time."""
+"""Time in nanoseconds, 146 years; what lies beyond is no time."""
 
 DISTORTION_MODELS: dict[str, Literal["pinhole", "radtan", "fisheye"]] = {
     "plumb_bob": "radtan",
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
-"""Names of ROS, and ours."""
+"""This package's names of the distortion models, by those of ROS."""
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
-"""Of views; the file may be named with or without."""
+"""Suffixes of the images of views; the file may be named with or without."""
 
 
 def listed(names: Iterable[str]) -> str:

@@ -13,10 +13,10 @@ from enerf_ns.dataparsers.errors import RecordingError
 NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 
 QUATERNION_TOLERANCE = 1e-3
-"""Largest error of a quaternion's norm that is renormalised."""
+"""Largest error of the norm of a quaternion that is renormalised."""
 
 FARTHEST = 1e9
-"""Metres that a camera may be away from the origin; beyond, splines overflow."""
+"""Most metres that a camera may be away from the origin; beyond, splines overflow."""
 
 
 def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
@@ -149,7 +149,7 @@ def read_poses(
 
 
 def _is_number(cell: str) -> bool:
-    """Whether it is a number as all programs write them; Python's may have underscores and digits of any script."""
+    """Whether a text is a number as all programs write them; Python's may have underscores and digits of any script."""
     try:
         float(cell)
     except ValueError:

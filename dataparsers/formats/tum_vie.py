@@ -86,11 +86,11 @@ PUBLISHED_EXTRINSICS = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-"""Pose of the left frame camera in the axes of the left event camera, metres; these three are of camera-calibrationA,
-with which mocap-desk and mocap-desk2 were recorded."""
+"""Pose of the left frame camera in the axes of the left event camera, metres; it and the two published cameras are of
+camera-calibrationA, with which mocap-desk and mocap-desk2 were recorded."""
 
 WRITTEN_SEQUENCE = "simulated"
-"""What the files of a recording that is written are named after."""
+"""Name that the files of a recording that is written begin with, in place of a sequence's."""
 
 SEQUENCES = {
     "A": ("loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"),
@@ -99,15 +99,15 @@ SEQUENCES = {
         *("running-easy", "running-hard", "skate-hard", "bike-easy", "bike-hard", "bike-dark", "floor2-dark"),
     ),
 }
-"""Which sequences were recorded with which calibration."""
+"""Names of the sequences, by the letter of the calibration that they were recorded with."""
 
 CALIBRATIONS = ("camera-calibration", "mocap-imu-calibration")
 
 SHORTEST_STEP = 100_000
-"""Nanoseconds between frames or poses."""
+"""Least nanoseconds between frames or poses (median)."""
 
 LONGEST_GAP = 200_000_000
-"""Nanoseconds between poses that interpolation may bridge."""
+"""Most nanoseconds between poses that interpolation may bridge."""
 
 BALANCE_TOLERANCE = 1.0
 """Pixels by which intrinsics may differ from those that OpenCV gives; its versions differ by less."""
@@ -118,7 +118,7 @@ class TumVieOptions(FormatOptions):
     """What is read of a recording."""
 
     event_camera: Literal["left", "right"] = "left"
-    """Which of the two event cameras, with the frame camera beside it."""
+    """Which of the two event cameras is read, with the frame camera beside it."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,10 @@ class _Rig:
     """What a layout's files say about the cameras of one side."""
 
     camera: Camera
-    """Of the events."""
+    """Camera of the events."""
     imu_from_camera: Float64[np.ndarray, "4 4"]
     frame_camera: Camera | None
-    """None without frames."""
+    """Camera of the frames; None without frames."""
     imu_from_frame_camera: Float64[np.ndarray, "4 4"]
     imu_from_marker: Float64[np.ndarray, "4 4"]
 
@@ -140,7 +140,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     The recording's zero of time is the earliest first stamp among events, frames and poses.
 
     Args:
-        folder: With the files above.
+        folder: With the files that the module describes.
         event_camera: Which events; the frames are those of the same side.
 
     Raises:
@@ -480,7 +480,7 @@ def _pose(path: Path, entry: dict, what: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def _read_marker(path: Path, published: str) -> Float64[np.ndarray, "4 4"]:
-    """T_imu_marker.
+    """T_imu_marker from the calibration of the markers.
 
     Args:
         path: The calibration of the markers.
@@ -499,7 +499,7 @@ def _read_marker(path: Path, published: str) -> Float64[np.ndarray, "4 4"]:
 
 
 class TumVieWriter(Writer):
-    """TUM-VIE as it is unpacked: its left cameras. Markers, IMU and event camera are in one place."""
+    """Writer of TUM-VIE as it is unpacked: its left cameras. Markers, IMU and event camera are in one place."""
 
     layout = "tum_vie"
     poses_per_second = 120

@@ -54,23 +54,23 @@ class Setup:
     event_from_frame: Float64[np.ndarray, "4 4"]
     """Extrinsics: pose of the frame camera in the axes of the event camera, metres."""
     trajectory: Trajectory | None
-    """Of the event camera; None for a source without poses, whose recording then lacks them too."""
+    """Trajectory of the event camera; None for a source without poses, whose recording then lacks them too."""
     frame_times: Int64[np.ndarray, " frames"]
-    """ns, increasing: the middles of the exposures."""
+    """Times of the frames, ns, increasing: the middles of the exposures."""
     exposure: int
-    """ns; 0 for sharp frames alone."""
+    """Exposure of the blurred frames, ns; 0 for sharp frames alone."""
     contrast_thresholds: tuple[float, float]
-    """Of on and of off events."""
+    """Contrast thresholds of on and of off events."""
     pixel_thresholds: Float32[np.ndarray, "2 height width"] | None = None
-    """On and off thresholds of each pixel, if they vary."""
+    """Contrast thresholds of each pixel for on and for off events, if they vary."""
     refractory_period: int = 0
     """For how long a pixel is blind after an event, ns."""
     bayer_pattern: str | None = None
-    """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1), (1, 1), such as RGGB; None for a grey one."""
+    """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1), (1, 1), such as RGGB; None for a grey camera."""
     response: str | None = None
     """How the event camera answers brightness, as `EventRecording.response` has it, where that is known."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """All else that simulation.json shall state; what JSON can hold."""
+    """All else that simulation.json shall state; values that JSON can hold."""
 
 
 class Writer(ABC):
@@ -82,26 +82,26 @@ class Writer(ABC):
 
     Raises:
         FlagError: The layout cannot hold these cameras or that few frames, or the extrinsics are no rigid motion.
-        OutputError: The disk is full; so do the methods.
+        OutputError: The disk is full; the methods raise it too.
     """
 
     layout: ClassVar[str]
-    """Name of the format that reads it."""
+    """Name of the format that reads the layout."""
     start: ClassVar[int] = 0
     """What the clock of the layout shows (ns) when the simulation's is at 0."""
     fewest_frames: ClassVar[int] = 1
-    """That others who read this layout accept."""
+    """Fewest frames that others who read this layout accept."""
     poses_per_second: ClassVar[int | None] = None
-    """As many as the data set has, where it has a fixed number."""
+    """Poses a second, as many as the data set has, where it has a fixed number."""
     published_rig: ClassVar[Rig | None] = None
     """The cameras of the data set, where it has its own."""
     events_held: ClassVar[int] = 2**16
     """Events that are held back until they are written, and those in a chunk of an HDF5 file."""
 
     num_events: int = 0
-    """Added so far."""
+    """Number of events added so far."""
     num_frames: int = 0
-    """Added so far."""
+    """Number of frames added so far."""
     notes: list[str]
     """What the user should know, one sentence each."""
 
@@ -161,7 +161,7 @@ class Writer(ABC):
             number: From 0.
             time: ns, as of the setup.
             sharp: The frame as the sensor reads it out, at that time.
-            blurred: The same with the setup's exposure; None if that is 0.
+            blurred: The frame with the setup's exposure; None if that is 0.
             depth: z-depth in metres that the frame camera sees at the frame's time, 0 where nothing is hit; None for a
                 source that knows none.
             linear: Linear brightness of the sharp and of the blurred frame, kept for its high dynamic range; None: it
@@ -220,7 +220,7 @@ class Writer(ABC):
         """What each table of frames gets for one at this time (ns), by path."""
 
     def _name(self, number: int) -> str:
-        """Of a frame's files, so that they sort as their numbers do."""
+        """Name of a frame's files, such that they sort as their numbers do."""
         return f"{number:0{max(5, len(str(len(self.setup.frame_times) - 1)))}d}"
 
     def _check_size(self, size: tuple[int, int]) -> None:
@@ -293,7 +293,7 @@ class EventFiles(Protocol):
     def append(self, events: Events) -> None: ...
 
     def close(self) -> None:
-        """Whatever has happened before, as many of each column can be read afterwards."""
+        """Closes the files; whatever has happened before, as many of each column can be read afterwards."""
 
 
 class GrowingArray:
@@ -321,7 +321,7 @@ class GrowingArray:
         self._file.close()
 
     def _header(self, num_rows: int) -> bytes:
-        """NumPy leaves room in it for any number of rows, so that it stays as long as it is."""
+        """Header of the file; NumPy leaves room in it for any number of rows, so that it stays as long as it is."""
         about = {"descr": self._dtype.str, "fortran_order": False, "shape": (num_rows, *self._columns)}
         header = BytesIO()
         np.lib.format.write_array_header_1_0(header, about)
@@ -345,12 +345,12 @@ def mounted_camera_json(camera: Camera, event_from_frame: Float64[np.ndarray, "4
 
 
 def encode_json(value: dict[str, Any]) -> bytes:
-    """A JSON file; numbers keep all their digits."""
+    """Content of a JSON file; numbers keep all their digits."""
     return (json.dumps(value, indent=2) + "\n").encode()
 
 
 def encode_npy(array: Shaped[np.ndarray, "..."], dtype: type = np.float32) -> bytes:
-    """A .npy file."""
+    """Content of a .npy file."""
     content = BytesIO()
     np.save(content, array.astype(dtype))
     return content.getvalue()
@@ -378,7 +378,7 @@ def encode_poses(
 def poses_at(
     trajectory: Trajectory, times: Int64[np.ndarray, " times"]
 ) -> tuple[Float64[np.ndarray, "times 3"], Float64[np.ndarray, "times 4"]]:
-    """Positions (metres), and quaternions xyzw, at other times (ns) than its own."""
+    """Positions (metres), and quaternions xyzw, of a trajectory at other times (ns) than its own."""
     poses = trajectory.poses(torch.from_numpy(times)).numpy()
     return poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat()
 
@@ -400,7 +400,7 @@ def _exr_enabled() -> bool:
 
 
 def _encode(kind: str, image: np.ndarray) -> bytes:
-    """An image file; OpenCV keeps colours as B G R."""
+    """Content of an image file; OpenCV keeps colours as B G R."""
     done, content = cv2.imencode(kind, image[..., ::-1] if image.ndim == 3 else image)
     assert done
     return content.tobytes()

@@ -74,7 +74,8 @@ class HashGrid(nn.Module):
     Args:
         num_levels: number of levels, at least 1.
         min_res: lattice cells along each side of the unit cube at the coarsest level.
-        max_res: the same at the finest level; the levels between are in geometric progression, rounded down.
+        max_res: lattice cells along each side of the unit cube at the finest level; the levels between are in
+            geometric progression, rounded down.
         log2_table_size: each level has 2**log2_table_size rows.
         features_per_level: numbers in one row.
         init_scale: the table starts uniform in [-init_scale, init_scale).

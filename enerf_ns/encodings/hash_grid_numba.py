@@ -21,8 +21,8 @@ from enerf_ns.compiled import compiled
 
 @compiled
 def _cell(x, i, scaling):
-    """Of position i: for each of the 4 edges along x of its cell, the hash of y and z with the weight; then the hash
-    and the weight of either end in x; then the weights of y and z."""
+    """Corners of the cell of position i: for each of its 4 edges along x, the hash of y and z with the weight; then the
+    hash and the weight of either end in x; then the weights of y and z."""
     x0, x1, x2 = x[i, 0] * scaling, x[i, 1] * scaling, x[i, 2] * scaling
     floor0, floor1, floor2 = np.floor(x0), np.floor(x1), np.floor(x2)
     w0, w1, w2 = x0 - floor0, x1 - floor1, x2 - floor2
@@ -149,7 +149,7 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(x: Tensor, table: Tensor, scalings: Tensor) -> Tensor:
-    """The same as `enerf_ns.encodings.hash_grid.hash_grid`, for float32 tensors on the CPU and two features per level;
-    differentiable once in `x` and `table`."""
+    """Trilinear interpolation of hashed features at every level, for float32 tensors on the CPU and two features per
+    level; differentiable once in `x` and `table`. Else as `enerf_ns.encodings.hash_grid.hash_grid`."""
     encoding = _HashGrid.apply(x.reshape(-1, 3).contiguous(), table.contiguous(), scalings)
     return encoding.reshape(*x.shape[:-1], encoding.shape[-1])

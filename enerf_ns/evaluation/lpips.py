@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 WEIGHTS_VARIABLE = "ENERF_LPIPS_WEIGHTS"
-"""Environment variable: a file with the state dict of torchvision's `alexnet().features` (ImageNet)."""
+"""Environment variable that names a file with the state dict of torchvision's `alexnet().features` (ImageNet)."""
 
 
 @functools.lru_cache(maxsize=1)

@@ -40,8 +40,10 @@ def align_channels(
     rendered: Sequence[Float[Tensor, "height width channels"]],
     recorded: Sequence[Float[Tensor, "height width channels"]],
 ) -> tuple[list[Float[Tensor, "height width channels"]], list[tuple[float, float]]]:
-    """As `align_brightness`, but each colour channel by itself: for colour that was learnt from colour events, which
-    leave the log brightness of every channel open (Robust e-NeRF, ICCV 2023, evaluates so).
+    """Fit one scale and offset of log brightness for each colour channel, and apply them; see `align_brightness`.
+
+    For colour that was learnt from colour events, which leave the log brightness of every channel open (Robust e-NeRF,
+    ICCV 2023, evaluates so).
 
     Returns:
         The aligned pictures, clipped to [0, 1], and (scale, offset) of each channel.

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
 
 PICTURE_ROWS = 3
-"""Held-out frames shown in the picture."""
+"""Number of held-out frames shown in the picture."""
 KEY_POSES = 7
-"""Held-out cameras that the video flies past."""
+"""Number of held-out cameras that the video flies past."""
 VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 
 

@@ -29,13 +29,13 @@ class Run:
     """A trained run, as it was stored."""
 
     config_file: Path
-    """Its config.yml."""
+    """config.yml of the run."""
     config: EnerfTrainerConfig
-    """What that file holds."""
+    """Config that config.yml holds."""
     pipeline: EnerfPipeline
-    """With the parameters of the last checkpoint."""
+    """Pipeline with the parameters of the last checkpoint."""
     train_seconds: float | None = None
-    """Wall time of the training and its set-up; None of a run that was loaded."""
+    """Wall time (s) of the training and its set-up; None of a run that was loaded."""
 
 
 def method_config(

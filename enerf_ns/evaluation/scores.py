@@ -52,7 +52,7 @@ def summary_scores(views: Sequence[HeldOutView], summary: Mapping[str, float]) -
 
     Args:
         views: At least one, as `held_out_views` gives them.
-        summary: Of the same.
+        summary: Numbers about the whole set, as `held_out_views` gives them.
 
     Returns:
         psnr (dB), ssim, lpips (None where its weights are missing), correlation, and with known depth depth_rmse and

@@ -53,7 +53,7 @@ class HeldOutView:
     recorded_depth: Tensor | None
     """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
     time: int
-    """Instant in ns."""
+    """Instant of the view, ns."""
 
 
 @torch.no_grad()

@@ -14,17 +14,17 @@ class EventBatch:
     """Pixels, each with two instants and the events that it fired between them, the second instant included."""
 
     pixels: Int64[Tensor, " pairs"]
-    """Numbers of the pixels, y * width + x."""
+    """Number of the pixel of each pair, y * width + x."""
     start: Int64[Tensor, " pairs"]
-    """First instant, ns; of a pair of events, that of its first event."""
+    """First instant of each pair, ns; of a pair of events, that of its first event."""
     end: Int64[Tensor, " pairs"]
-    """Second instant, ns; later than the first."""
+    """Second instant of each pair, ns; later than the first."""
     on: Int64[Tensor, " pairs"]
-    """Number of positive events."""
+    """Number of positive events of each pair, after the first instant and up to and with the second."""
     off: Int64[Tensor, " pairs"]
-    """Number of negative events."""
+    """Number of negative events of each pair, after the first instant and up to and with the second."""
     silent: Bool[Tensor, " pairs"]
-    """Whether the pair is of a silent pixel, whose instants are any between two of its events."""
+    """Whether each pair is of a silent pixel, whose instants are any between two of its events."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -41,21 +41,22 @@ class FrameBatch:
     """Pixels of frames."""
 
     indices: Int64[Tensor, "rays 3"]
-    """Frame, row and column of each."""
+    """Frame, row and column of each pixel."""
     colours: Float[Tensor, "rays 3"]
-    """What was recorded there, in [0, 1]."""
+    """Colours that were recorded at the pixels, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class TrainBatch:
-    """Of events, of frames, or of both. Its rays are rendered in one go: all starts, all ends, all pixels of frames."""
+    """A batch of events, of frames, or of both. Its rays are rendered in one go: all starts, all ends, all pixels of
+    frames."""
 
     events: EventBatch | None
     frames: FrameBatch | None
 
     @property
     def num_pairs(self) -> int:
-        """Pairs of instants, of events and of silent pixels."""
+        """Number of pairs of instants, of events and of silent pixels."""
         return 0 if self.events is None else len(self.events)
 
     def split(self, rendered: Float[Tensor, "rays channels"]) -> tuple[Tensor, Tensor, Tensor]:

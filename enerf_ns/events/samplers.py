@@ -136,7 +136,7 @@ class SilentPixelSampler:
         max_duration_ns: At least 2.
 
     Raises:
-        ValueError: A duration is shorter than that.
+        ValueError: A duration is shorter than its minimum.
     """
 
     ROUNDS = 32

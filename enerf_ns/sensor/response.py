@@ -18,13 +18,13 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 LINEAR_UNTIL = 20.0
-"""B of the paper: linlog is linear below this brightness (of 255) and logarithmic above."""
+"""Brightness (of 255) below which linlog is linear, and above which it is logarithmic; B of the E-NeRF paper."""
 
 Array = TypeVar("Array", Tensor, np.ndarray)
-"""Of PyTorch or of NumPy."""
+"""Array type of PyTorch or of NumPy."""
 
 SMALLEST_OFFSET, LARGEST_OFFSET = 1e-9, 1.0
-"""Of `Logarithm`."""
+"""Smallest and largest offset of `Logarithm`."""
 
 
 class Response(Protocol):
@@ -32,7 +32,7 @@ class Response(Protocol):
 
     @property
     def name(self) -> str:
-        """As `response_named` reads it."""
+        """Name of the response, as `response_named` reads it."""
         ...
 
     def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -50,15 +50,15 @@ class Linlog:
 
     @property
     def name(self) -> str:
-        """As `response_named` reads it."""
+        """Name of the response, as `response_named` reads it."""
         return "linlog"
 
     def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """As of `linlog`."""
+        """Log brightness of E-NeRF; see `linlog`."""
         return linlog(brightness)
 
     def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """As of `inverse_linlog`."""
+        """Linear brightness whose log brightness is the argument; see `inverse_linlog`."""
         return inverse_linlog(log_brightness)
 
 
@@ -70,11 +70,11 @@ class Logarithm:
 
     @property
     def name(self) -> str:
-        """As `response_named` reads it."""
+        """Name of the response, as `response_named` reads it."""
         return f"logarithm:{self.offset!r}"
 
     def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Log brightness; of brightness above -offset."""
+        """Log brightness of brightness above -offset."""
         return _library(brightness).log(brightness + self.offset)
 
     def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -15,7 +15,7 @@ DEFAULT_CONTRAST_THRESHOLD = 0.25
 """Mean threshold assumed where a recording does not state one. Events fix brightness only up to this factor."""
 
 GREY = "grey"
-"""In place of a Bayer pattern: a sensor without a colour filter."""
+"""Name in place of a Bayer pattern for a sensor without a colour filter."""
 
 
 @dataclass
@@ -24,15 +24,15 @@ class SensorModelConfig:
 
     _target: Type[SensorModel] = field(default_factory=lambda: SensorModel)  # noqa: UP006
     contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
-    """C_on and C_off. None: the recording's own, else from the counts of both polarities."""
+    """Contrast thresholds C_on and C_off. None: the recording's own, else from the counts of both polarities."""
     response: Optional[str] = None  # noqa: UP045
     """What a pixel makes of brightness: linlog, or logarithm:OFFSET. None: the recording's own, else linlog."""
     refractory_period_ns: Optional[int] = None  # noqa: UP045
-    """For how long a pixel is blind after an event. None: the recording's own."""
+    """For how long (ns) a pixel is blind after an event. None: the recording's own."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
     """Colours of the pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; grey: none. None: the recording's own."""
     width: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
-    """Of the sensor, pixels."""
+    """Width of the sensor, pixels."""
 
     def setup(self) -> SensorModel:
         """The sensor of this config, whose class is `_target`."""
@@ -98,7 +98,7 @@ class SensorModel(nn.Module):
 
     @property
     def mean_threshold(self) -> float | Tensor:
-        """The unit in which losses count changes of log brightness."""
+        """Mean contrast threshold: the unit in which losses count changes of log brightness."""
         c_on, c_off = self.contrast_thresholds
         return 0.5 * (c_on + c_off)
 

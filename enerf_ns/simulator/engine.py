@@ -30,10 +30,11 @@ from enerf_ns.simulator.sources import Pictures, RenderedScene, Source, TrainedR
 from enerf_ns.simulator.view import View, view_of
 
 FRAME_RATE, EXPOSURE_MS = 41.0, 20.0
-"""Frames per second, and the exposure of blurred ones, where neither a preset nor a setting states them."""
+"""Frames per second, and exposure of blurred frames in milliseconds, where neither a preset nor a setting states
+them."""
 
 WINDOW = 10**9
-"""Nanoseconds for which it is found out at once when to render."""
+"""Nanoseconds of the recording for which it is found out at once when to render."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,13 @@ class Simulation:
     """What was simulated."""
 
     folder: Path
-    """Of the recording."""
+    """Folder of the recording."""
     duration: int
-    """ns"""
+    """Length of the recording, ns."""
     num_events: int
     num_frames: int
     has_poses: bool
-    """False for pictures, on which nothing can be trained."""
+    """Whether the recording has poses; False for pictures, on which nothing can be trained."""
     notes: tuple[str, ...]
     """What the user should know, one sentence each."""
 
@@ -111,7 +112,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
 
 
 def _exposures(settings: SimulationSettings, view: View) -> Exposures:
-    """Of frames that are evenly spread, in whole microseconds."""
+    """Exposures of frames that are evenly spread, in whole microseconds."""
     preset, length = settings.preset, view.end - view.start
     rate = preset.num_frames / preset.duration if preset else FRAME_RATE
     assert settings.layout is not None

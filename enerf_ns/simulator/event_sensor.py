@@ -41,10 +41,10 @@ READOUT_QUEUE = 1000
 """Events that may wait for the bus; one that comes while so many wait is lost."""
 
 SENSOR = 1
-"""Draws, with the seed, what is of the sensor; scene and motion are drawn from the seed alone."""
+"""Number that draws, with the seed, what is of the sensor; scene and motion are drawn from the seed alone."""
 
 CUT_JITTER = 6
-"""Standard deviations that jitter is cut at."""
+"""Standard deviations at which the jitter of times is cut."""
 
 TOLERANCE = 1e-9
 """Log brightness by which a threshold may be missed and still be reached: far above rounding, far below any noise."""
@@ -53,10 +53,11 @@ KNEE = math.log(LINEAR_UNTIL)
 """Log brightness up to which linlog is linear."""
 
 LEAST_THRESHOLD = 0.001
-"""Change of log brightness; sensors have more than ten times as much, and events beyond number would follow."""
+"""Least contrast threshold, change of log brightness; sensors have more than ten times as much, and below it events
+beyond number would follow."""
 
 NEVER = 2**62
-"""Nanoseconds."""
+"""Time (ns) of what never happens."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class SensorSettings:
     hot_pixel_rate: float = 1000.0
     """Noise events per second of a hot pixel, whatever it sees."""
     cutoff_frequency: float = 0.0
-    """Of the photoreceptor at brightness 1, in Hz; at brightness b it is (255 b + 20) / 275 of it. 0: no low pass."""
+    """Cut-off frequency of the photoreceptor at brightness 1, in Hz; at brightness b it is (255 b + 20) / 275 of that.
+    0: no low pass."""
     timestamp_jitter: float = 0.0
     """Standard deviation of the times of events in nanoseconds; they are put in order after that."""
     readout_rate: float = 0.0
@@ -91,7 +93,7 @@ class SensorSettings:
     """How log brightness comes of brightness: logarithm:OFFSET, which adds the offset to it and takes the logarithm, or
     linlog, as E-NeRF has it."""
     seed: int = 0
-    """Draws all that is random."""
+    """Seed that draws all that is random."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -117,11 +119,11 @@ class PartialPicture(NamedTuple):
     """Brightness of some pixels at a time between two pictures."""
 
     time: int
-    """Nanoseconds."""
+    """Time of the picture, ns."""
     pixels: Int64[np.ndarray, " pixels"]
-    """Their numbers, y * width + x."""
+    """Numbers of the pixels, y * width + x."""
     brightness: Float[np.ndarray, "pixels *channels"]
-    """Linear."""
+    """Linear brightness of the pixels."""
 
 
 class _Pixels(NamedTuple):
@@ -130,23 +132,24 @@ class _Pixels(NamedTuple):
     on: np.ndarray
     off: np.ndarray
     leak: np.ndarray
-    """Per nanosecond."""
+    """By how much leak raises each pixel's level, per nanosecond."""
     noise_rate: np.ndarray
-    """Per nanosecond, at brightness 0."""
+    """Noise events of each pixel per nanosecond, at brightness 0."""
     hot: np.ndarray
     signal: np.ndarray
-    """At the time of the last picture, without leak."""
+    """Signal of each pixel at the time of the last picture, without leak."""
     memorised: np.ndarray
     rises: np.ndarray
     falls: np.ndarray
-    """Thresholds passed since; the memory is now `memorised + rises * on - falls * off`, without adding up errors."""
+    """Off thresholds, as `rises` are on thresholds, passed since `memorised`; the memory is now `memorised + rises * on
+    - falls * off`, without adding up errors."""
     upper: np.ndarray
     lower: np.ndarray
-    """Levels of the next on event and the next off event."""
+    """Level of each pixel's next off event, as `upper` is that of its next on event."""
     awake: np.ndarray
-    """Nanoseconds: until then it is deaf, and then it memorises."""
+    """Time (ns) until which each pixel is deaf, and at which it then memorises."""
     noise: np.ndarray
-    """Nanoseconds: when noise may come next."""
+    """Time (ns) when noise may come next to each pixel."""
     num_noise: np.ndarray
     num_events: np.ndarray
 
@@ -213,7 +216,7 @@ class EventSensor:
         _first_noise(self._pixels, self._keys)
         self._held = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int8)
         self._bus_free = 0.0
-        """Nanoseconds since the start."""
+        """When the bus has carried all that came before, nanoseconds since the start."""
 
     def advance(
         self, brightness: Float[np.ndarray, "height width"], time: int, before: Sequence[PartialPicture] = ()
@@ -223,7 +226,7 @@ class EventSensor:
         Jitter and a slow bus hold events back; they come with a later call, or from `finish`.
 
         Args:
-            brightness: as for the first picture.
+            brightness: [H, W], as `EventSensor` takes that of the first picture.
             time: int nanoseconds, later than that of the last picture.
             before: what some of the pixels saw between the last picture and this one, later one by one.
 
@@ -396,7 +399,7 @@ def _brightness(level, offset):  # pragma: no cover
 
 @compiled
 def _level(curve, s):  # pragma: no cover
-    """Level at s: the low pass of a line, plus leak.
+    """Level of a curve at time s: the low pass of a line, plus leak.
 
     A curve is, at its start: the level, how far the input is above the output, the slopes of input and of leak, and the
     angular frequency of the low pass (0: there is none, output is input).
@@ -410,7 +413,7 @@ def _level(curve, s):  # pragma: no cover
 
 @compiled
 def _turn(curve):  # pragma: no cover
-    """When the level is highest or lowest; infinity if it always rises or always falls."""
+    """When the level of a curve is highest or lowest; infinity if it always rises or always falls."""
     _, pull, slope, leak, decay = curve
     remaining = (slope + leak) / (slope - pull * decay)
     return -np.log(remaining) / decay if decay > 0 and 0 < remaining < 1 else np.inf
@@ -477,13 +480,13 @@ def _random(key, pixel, number):  # pragma: no cover
 
 @compiled
 def _uniform(bits):  # pragma: no cover
-    """In (0, 1], of the upper 53 bits."""
+    """Uniform random number in (0, 1], from the upper 53 of 64 bits."""
     return (np.float64(bits >> np.uint64(11)) + 1) * 2.0**-53
 
 
 @compiled
 def _normal(keys, pixel, number):  # pragma: no cover
-    """By Box and Muller's method."""
+    """Normal random number by Box and Muller's method, cut at `CUT_JITTER`."""
     radius = np.sqrt(-2 * np.log(_uniform(_random(keys[2], pixel, number))))
     return min(max(radius * np.cos(2 * np.pi * _uniform(_random(keys[3], pixel, number))), -CUT_JITTER), CUT_JITTER)
 

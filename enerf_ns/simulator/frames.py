@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64, UInt8
 from enerf_ns.dataparsers.errors import FlagError
 
 MOST_LEVEL = 1e6
-"""Of what is white; pixels brighter than this have the noise of this."""
+"""Brightness, as a multiple of what is white, above which pixels have the noise of this brightness."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class FrameSettings:
     saturation: float = 1.0
     """Brightness, above 0, from which on pixels are white."""
     read_noise: float = 0.0
-    """Standard deviation in grey levels, of which there are 255."""
+    """Standard deviation of the noise of reading out, in grey levels, of which there are 255."""
     shot_noise: float = 0.0
     """Electrons in a pixel that is white, its full well: the fewer, the more noise; 0 for no noise."""
     hdr: bool = False
@@ -46,13 +46,13 @@ class Frame:
     """What falls on the sensor: linear brightness, in colour R G B."""
 
     number: int
-    """From 0."""
+    """Number of the frame, from 0."""
     time: int
-    """ns, the middle of the exposure."""
+    """Time of the frame, ns: the middle of the exposure."""
     sharp: Float[np.ndarray, "height width *channels"]
-    """At that time."""
+    """Brightness at the time of the frame."""
     blurred: Float[np.ndarray, "height width *channels"] | None
-    """The mean over the exposure; None if that is 0."""
+    """Mean brightness over the exposure; None if the exposure is 0."""
 
 
 class Exposures:

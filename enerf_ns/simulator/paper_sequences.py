@@ -20,27 +20,27 @@ class SimulationPreset:
     """How one sequence is simulated."""
 
     scene: Literal["roads", "moon"]
-    """A name of `scenes.SCENES`."""
+    """Name of the scene in `scenes.SCENES`."""
     motion: Literal["shake", "spiral"]
-    """Forward-facing with abrupt turns, or inward."""
+    """Motion of the camera: forward-facing with abrupt turns, or inward."""
     turns_per_second: float
     """How often a shaking camera turns back, or how often a camera goes round its target."""
     num_frames: int
-    """As many as the paper's configs select from."""
+    """Number of frames: as many as the paper's configs select from."""
     duration: float
-    """Seconds."""
+    """Length of the recording, seconds."""
     exposure_ms: float
-    """Of the blurred frames, milliseconds."""
+    """Exposure of the blurred frames, milliseconds."""
     blur: float
     """How far the picture moves during an exposure: pixels, mean over the picture, the frames and many seeds."""
     width: int = 640
-    """Pixels."""
+    """Width of events and frames, pixels."""
     height: int = 480
-    """Pixels."""
+    """Height of events and frames, pixels."""
     field_of_view: float = 60.0
-    """Horizontal, degrees."""
+    """Horizontal field of view, degrees."""
     contrast_thresholds: tuple[float, float] = (0.2, 0.2)
-    """Those that the paper learns with, of on and of off events."""
+    """Contrast thresholds that the paper learns with, of on and of off events."""
 
     def trajectory(self, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> Trajectory:
         """The motion of this preset before a scene; arguments as of `trajectories.shake`."""
@@ -57,4 +57,5 @@ PRESETS = {
         "roads", "shake", 6.0, num_frames=41, duration=1.025, exposure_ms=22.0, blur=20.0
     ),
 }
-"""Mild blur (spiral1, spiral2, shake-moon1), medium (shake-moon2) and strong (shake-carpet1)."""
+"""Sequences by name: with mild blur (spiral1, spiral2, shake-moon1), medium (shake-moon2) and strong
+(shake-carpet1)."""

@@ -13,7 +13,7 @@ from enerf_ns.dataparsers.files import in_colour
 from enerf_ns.dataparsers.recording import Events
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
-"""R G B of pixels whose latest event was off, that had none, and whose latest was on."""
+"""Colours (R G B) of pixels whose latest event was off, that had none, and whose latest was on."""
 
 
 class Preview:
@@ -45,7 +45,7 @@ class Preview:
         blurred: UInt8[np.ndarray, "height width *channels"] | None,
         depth: Float[np.ndarray, "height width"] | None,
     ) -> None:
-        """Adds a picture with the events since the frame before; from frame to frame the same of the others are there.
+        """Adds a picture with the events since the frame before; every frame has the same kinds of pictures.
 
         Args:
             sharp, blurred: Of the frame camera, in grey or R G B.
@@ -97,7 +97,7 @@ class Preview:
         return video
 
     def _colour_depth(self, depth: np.ndarray) -> np.ndarray:
-        """On a scale that is that of the first frame with depth."""
+        """Depth in colours, on the scale of the first frame with depth."""
         seen = depth > 0
         inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=seen)
         if self._inverse_depths is None and seen.any():

@@ -18,33 +18,34 @@ from enerf_ns.simulator.event_sensor import PartialPicture
 from enerf_ns.simulator.scene.render import pixel_steps
 
 MOTION_STEP = 1_000_000
-"""Nanoseconds from one pose to the next of those between which displacements are measured."""
+"""Nanoseconds from one to the next of the poses between which displacements are measured."""
 
 STEPS_PER_DEPTH = 5
-"""Of these steps, for which the points that the camera sees in their middle are followed."""
+"""Number of steps of `MOTION_STEP` for which the points that the camera sees in their middle are followed."""
 
 GRID = 64
 """Points that are followed, across and down the picture, or every pixel where it has fewer; each as near as the nearest
 thing seen between it and the next."""
 
 MAX_DISPLACEMENT = 0.5
-"""Pixels, from one picture to the next."""
+"""Most pixels that a point may move from one picture to the next."""
 
 MAX_CHANGE = 0.3
-"""Of log brightness, from one time at which a pixel is rendered to the next."""
+"""Most that log brightness may change from one time at which a pixel is rendered to the next."""
 
 MOST_HALVINGS = 3
-"""Of an interval. A pixel is the mean of 16 samples, so that an edge passes it in as many steps: from half a pixel of
-motion between pictures three halvings lead to that of one step, and more would show the steps alone."""
+"""How many times an interval is halved at most. A pixel is the mean of 16 samples, so that an edge passes it in as many
+steps: from half a pixel of motion between pictures three halvings lead to that of one step, and more would show the
+steps alone."""
 
 
 class Render(NamedTuple):
     """A picture of a sequence."""
 
     time: int
-    """Nanoseconds."""
+    """Time of the picture, ns."""
     brightness: Float[np.ndarray, "height width *channels"]
-    """Linear."""
+    """Linear brightness of all pixels."""
     before: list[PartialPicture]
     """Pixels whose brightness was needed between the last picture and this one, in the order of time."""
 
@@ -153,7 +154,7 @@ def adaptive_renders(
             partial_pictures[earlier] = pool.submit(halve, earlier)
 
     def halve(index: int) -> list[PartialPicture]:
-        """The interval that ends with this picture."""
+        """The partial pictures in the interval that ends with this picture."""
         if max_change == np.inf:
             return []
         around = range(max(0, index - 2), min(len(times), index + 2))
@@ -170,7 +171,8 @@ def adaptive_renders(
     def between(
         start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, error: np.ndarray, halvings=0
     ) -> list[PartialPicture]:
-        """An interval of some pixels: log brightness before and after it, and by how much it may stray from a line."""
+        """The partial pictures in an interval of some pixels, from their log brightness before and after it, and by how
+        much it may stray from a line."""
         wrong = ((np.abs(after - before) > max_change) | (error > max_error)).any(axis=1)
         middle = (start + end) // 2
         if halvings == MOST_HALVINGS or middle == start or not wrong.any():

@@ -40,31 +40,35 @@ class SimulationSettings:
     motion: Optional[Literal["shake", "spiral"]] = None  # noqa: UP045
     """How the camera moves: forward-facing with abrupt turns, or an inward spiral. None: as the preset, or shake."""
     key_frames: Optional[Path] = None  # noqa: UP045
-    """Text file of the camera's places and targets instead, `t x y z tx ty tz` a line: seconds, metres, z up."""
+    """Text file of the camera's places and targets, used instead of a motion, `t x y z tx ty tz` a line: seconds,
+    metres, z up."""
     trajectory: Optional[Path] = None  # noqa: UP045
-    """Recording, or text file of poses, `t px py pz qx qy qz qw` a line, whose motion is used instead."""
+    """Recording, or text file of poses, `t px py pz qx qy qz qw` a line, whose motion is used instead of shake or
+    spiral."""
     trajectory_unit: Literal["s", "us", "ns"] = "s"
     """Unit of the times of a file of poses."""
     duration: Optional[float] = None  # noqa: UP045
     """Length of the recording in seconds. None: that of the preset, the trajectory or the video, or 1."""
     num_frames: Optional[int] = None  # noqa: UP045
-    """Frames, at regular times. None: as many a second as the preset, or 41."""
+    """Number of frames, at regular times. None: as many a second as the preset, or 41."""
     exposure_ms: Optional[float] = None  # noqa: UP045
     """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
     preset, or 20, but no longer than from one frame to the next."""
     width: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset or the run, or 160; in proportion, if height is given."""
+    """Width of events and frames, in pixels. None: as the preset or the run, or 160; in proportion, if height is
+    given."""
     height: Optional[int] = None  # noqa: UP045
-    """Of events and frames, in pixels. None: as the preset or the run, or 120; in proportion, if width is given."""
+    """Height of events and frames, in pixels. None: as the preset or the run, or 120; in proportion, if width is
+    given."""
     field_of_view: Optional[float] = None  # noqa: UP045
-    """Horizontal, in degrees. None: as the preset or the run, or 60."""
+    """Horizontal field of view, in degrees. None: as the preset or the run, or 60."""
     cameras: Optional[Path] = None  # noqa: UP045
     """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
     layout: Optional[Layout] = None  # noqa: UP045
-    """Of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim, and for
-    images, videos, runs and colour filters this package's own."""
+    """Layout of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim,
+    and for images, videos, runs and colour filters this package's own."""
     colour: Annotated[bool, tyro.conf.arg(aliases=["--color"])] = False
-    """Frames in colour, where the scene is."""
+    """Make frames in colour, where the scene is."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
     """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; None: a grey sensor."""
     frames_per_second: Optional[float] = None  # noqa: UP045
@@ -80,7 +84,7 @@ class SimulationSettings:
     max_change: float = MAX_CHANGE
     """By how much a pixel's log brightness may change at most before it is rendered again, between pictures."""
     sensor: Annotated[SensorSettings, tyro.conf.arg(name="")] = field(default_factory=SensorSettings)
-    """Of events."""
+    """The sensor of the events."""
     frame: FrameSettings = field(default_factory=FrameSettings)
     """The sensor of the frames."""
 
@@ -94,7 +98,7 @@ class SimulationSettings:
 
     @property
     def preset(self) -> SimulationPreset | None:
-        """What the scene stands for, if it is a preset."""
+        """The preset that the scene names, if it is one."""
         return PRESETS.get(self.scene or "")
 
 

@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 FRAMES_KEPT = 8
-"""Of a video, for threads that ask for its frames not quite in order."""
+"""Number of a video's frames that are kept for threads that ask for its frames not quite in order."""
 
 SHARE_DECODED = 0.9
-"""Of the frames that a video states to have, which not all count exactly; with fewer, its end is missing."""
+"""Least share that can be decoded of the frames that a video states to have, which not all count exactly; with fewer,
+its end is missing."""
 
 OPENGL_AXES = np.array([1.0, -1.0, -1.0, 1.0])
 """Turns the columns of a pose [R | t] from x right, y down, z forward to x right, y up, z back, and back again."""
@@ -43,18 +44,18 @@ class Source(Protocol):
     """A picture at any time."""
 
     start: int
-    """First time at which it can be seen, ns."""
+    """First time at which the source can be seen, ns."""
     end: int
-    """Last time at which it can be seen, ns."""
+    """Last time at which the source can be seen, ns."""
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Width of the picture, pixels."""
         ...
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Height of the picture, pixels."""
         ...
 
     def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
@@ -78,7 +79,7 @@ class RenderedScene:
         self.start, self.end = trajectory.start, trajectory.end
 
     def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
-        """As of `Source`."""
+        """Linear brightness at a time; see `Source.brightness`."""
         return self.renderer.brightness(_pose(self.trajectory, time), pixels)
 
     def depth(self, time: int) -> Float32[np.ndarray, "height width"]:
@@ -111,7 +112,7 @@ class Pictures(ABC):
     def brightness(
         self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
     ) -> Float32[np.ndarray, "*pixels"]:
-        """As of `Source`.
+        """Linear brightness at a time; see `Source.brightness`.
 
         Raises:
             RecordingError: The picture before or after this time cannot be read, or is of another kind than the first.
@@ -317,18 +318,18 @@ class TrainedRun:
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Width of the picture, pixels."""
         return self.camera.width
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Height of the picture, pixels."""
         return self.camera.height
 
     def brightness(
         self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
     ) -> Float32[np.ndarray, "*pixels"]:
-        """As of `Source`; grey where the field is."""
+        """Linear brightness at a time, grey where the field is; see `Source.brightness`."""
         rgb = self._render(time, "rgb", pixels)
         if not self._is_linear:
             return linear_from_srgb(rgb.clip(0, 1)).astype(np.float32)
@@ -343,7 +344,7 @@ class TrainedRun:
 
     @torch.no_grad()
     def _render(self, time: int, output: str, pixels: np.ndarray | None = None) -> np.ndarray:
-        """[height, width, channels], or [pixels, channels] of those that are wanted."""
+        """What the field shows at a time, [height, width, channels], or [pixels, channels] of those that are wanted."""
         from nerfstudio.cameras.cameras import Cameras
         from nerfstudio.models.base_model import Model
 
@@ -377,7 +378,7 @@ class TrainedRun:
         return values if casts_rays else values[pixels]
 
     def _past(self, cameras: Any, duration: int) -> Trajectory:
-        """Through cameras of the training, in the world of the run's data."""
+        """Trajectory through cameras of the training, in the world of the run's data."""
         if len(cameras) < 2:
             raise RecordingError(f"{self.config} was trained on one camera; give a --trajectory to render it along.")
         poses = cameras.camera_to_worlds.double().cpu().numpy() * OPENGL_AXES
@@ -405,12 +406,12 @@ def _regular_times(path: Path, count: int, rate: float) -> np.ndarray:
 
 
 def _by_number(file: Path) -> tuple[list, str]:
-    """For sorting names so that picture10 comes after picture9."""
+    """Key that sorts names so that picture10 comes after picture9."""
     parts = re.split(r"([0-9]+)", file.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], file.name
 
 
 def _camera(camera: Any) -> Camera:
-    """Of a camera of Nerfstudio, without its distortion."""
+    """Camera made from one of Nerfstudio, without its distortion."""
     fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
     return Camera(int(camera.width), int(camera.height), fx, fy, cx - 0.5, cy - 0.5)

@@ -18,13 +18,14 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 POSES_PER_SECOND = 1000
 
 SHORTEST, LONGEST = 10**6, 10**12
-"""Nanoseconds that a trajectory from a file may last; others' times are in another unit than was thought."""
+"""Least and most nanoseconds that a trajectory from a file may last; others' times are in another unit than was
+thought."""
 
 SMALLEST_DISTANCE = 1e-3
-"""Metres between a camera and its target."""
+"""Smallest distance between a camera and its target, metres."""
 
 STEEPEST_LOOK = 0.01
-"""Angle to the vertical, radians, below which upright has no meaning."""
+"""Angle between the view and the vertical, radians, below which upright has no meaning."""
 
 
 def shake(

@@ -25,13 +25,14 @@ from enerf_ns.simulator.sources import ImageFolder, RenderedScene, Source, Train
 from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
 
 SECONDS, SIZE, FIELD_OF_VIEW = 1.0, (160, 120), 60.0
-"""Of a recording for which neither a preset nor a setting states them."""
+"""Length (s), width and height (pixels) and horizontal field of view (degrees) of a recording for which neither a
+preset nor a setting states them."""
 
 MOST_PIXELS = 2**24
-"""Of a camera; rendering takes up to a kilobyte of memory for each."""
+"""Most pixels of a camera; rendering takes up to a kilobyte of memory for each."""
 
 SPARSE = 20_000_000
-"""Nanoseconds between poses, above which they are made denser where a second camera is mounted on the first."""
+"""Nanoseconds between poses, above which poses are made denser where a second camera is mounted on the first."""
 
 
 @dataclass(frozen=True)
@@ -39,19 +40,19 @@ class View:
     """What is looked at, by which cameras, from where and how long."""
 
     events: Source
-    """As the event camera sees it."""
+    """What is looked at as the event camera sees it."""
     frames: Source | None
-    """As the camera of the frames sees it; None: that of the events takes them."""
+    """What is looked at as the camera of the frames sees it; None: that of the events takes them."""
     trajectory: Trajectory | None
-    """Of the event camera; None for pictures."""
+    """Trajectory of the event camera; None for pictures."""
     event_camera: Camera
     frame_camera: Camera
     event_from_frame: Float64[np.ndarray, "4 4"]
     """Pose of the camera of the frames in the axes of that of the events, metres."""
     start: int
-    """ns"""
+    """Start of the recording, ns."""
     end: int
-    """ns"""
+    """End of the recording, ns."""
 
 
 def view_of(settings: SimulationSettings, notes: list[str]) -> View:
@@ -130,7 +131,7 @@ def _scene(settings: SimulationSettings, name: str, rng: np.random.Generator, no
 
 
 def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator, notes: list[str]) -> Trajectory:
-    """Of the event camera, with as many poses as the layout has."""
+    """Trajectory of the event camera, with as many poses as the layout has."""
     trajectory, preset = _given_trajectory(settings, notes), settings.preset
     if trajectory is None and preset is not None:
         moved = replace(preset, duration=settings.duration or preset.duration, motion=settings.motion or preset.motion)
@@ -160,7 +161,7 @@ def _given_trajectory(settings: SimulationSettings, notes: list[str]) -> Traject
 
 
 def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
-    """Of events and of frames, and the pose of the latter in the axes of the former."""
+    """Cameras of events and of frames, and the pose of the latter in the axes of the former."""
     assert settings.layout is not None
     rig = writer_of(settings.layout).published_rig
     if settings.cameras is not None:
@@ -178,7 +179,7 @@ def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
 
 
 def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera:
-    """As the settings, and where they are None as another camera or the preset has it."""
+    """Pinhole camera of the settings, and where they are None as another camera or the preset has it."""
     usual, angle = SIZE, FIELD_OF_VIEW
     if like is not None:
         usual, angle = (like.width, like.height), 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
@@ -196,12 +197,12 @@ def _centred(width: int, height: int, field_of_view: float) -> Camera:
 
 
 def _duration(settings: SimulationSettings) -> int | None:
-    """ns"""
+    """Length of the recording that the settings state, ns."""
     return None if settings.duration is None else round(settings.duration * 1e9)
 
 
 def _end(settings: SimulationSettings, last: int, name: str) -> int:
-    """When the recording ends (ns), of what is called so and can be seen until `last`."""
+    """When the recording ends (ns) of what is called `name` and can be seen until `last`."""
     wanted = _duration(settings)
     if wanted is not None and wanted > last:
         raise FlagError(

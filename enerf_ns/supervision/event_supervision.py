@@ -19,14 +19,15 @@ from enerf_ns.supervision.losses import (
 )
 
 EventLoss = Callable[[Tensor, Tensor, "float | Tensor"], Tensor]
-"""Rendered changes of log brightness (pairs,), measured ones (pairs,), mean contrast threshold; gives one number."""
+"""Loss of events: a function of rendered changes of log brightness (pairs,), measured ones (pairs,) and the mean
+contrast threshold that gives one number."""
 
 EVENT_LOSSES: dict[str, EventLoss] = {
     "huber": huber_event_loss,
     "squared": squared_event_loss,
     "normalised": lambda predicted, measured, _: normalised_event_loss(predicted, measured),
 }
-"""By the names that the flag event-loss takes; a loss of one's own is put in here."""
+"""Losses by the names that the flag event-loss takes; a loss of one's own is put in here."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class EventSupervision:
     """Losses and metrics of the pairs of a batch; of a field, splats, or anything else that renders brightness."""
 
     event_loss: str
-    """A name of `EVENT_LOSSES`."""
+    """Name of the loss of events, one of `EVENT_LOSSES`."""
     event_loss_weight: float
     no_event_loss_weight: float
-    """Of the loss on silent pixels."""
+    """Weight of the loss on silent pixels."""
     no_event_margin: float
     """Share of the threshold that a silent pixel may change at no cost."""
 

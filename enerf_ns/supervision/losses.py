@@ -28,7 +28,9 @@ def squared_event_loss(
 def huber_event_loss(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float | Tensor
 ) -> Float[Tensor, ""]:
-    """As `squared_event_loss`, but linear beyond one threshold, so that pairs with wrong or missing events count less.
+    """Mean Huber loss of the change of log brightness, in units of the contrast threshold.
+
+    As `squared_event_loss`, but linear beyond one threshold, so that pairs with wrong or missing events count less.
 
     Twice the Huber loss with delta 1 of the error in units of the mean threshold (the loss of Deblur e-NeRF, Low and
     Lee, ECCV 2024): equal to the squared error below one threshold.

@@ -31,7 +31,7 @@ BLOCK = 256
 """Samples that a triangle is tried in at once: the loop over them becomes vector instructions."""
 
 SLACK = 1e-4
-"""By how much of its size a part of the picture is taken larger than it is, against rounding."""
+"""By how much of its size a part of the picture is taken to be larger than it is, against rounding."""
 
 EDGE_ON = 1e-7
 """Sine of the angle between a triangle and the ray to one of its corners below which it is not seen."""
@@ -94,15 +94,15 @@ class _Samples:
     """Directions (x, y, 1), camera axes, in which a camera is sampled, by square blocks of pixels; and their tree."""
 
     x: Float32[np.ndarray, "blocks 256"]
-    """Within a block by pixel, row by row, and within a pixel by sample."""
+    """x of each direction: within a block by pixel, row by row, and within a pixel by sample."""
     y: Float32[np.ndarray, "blocks 256"]
     sizes: Float32[np.ndarray, "blocks pixels"]
     """Side of a square as large as the share of a pixel that a group of samples stands for, in x and y."""
     order: Int64[np.ndarray, "height width"]
-    """Where the pixels of the picture stand among those of all blocks."""
+    """Where each pixel of the picture stands among the pixels of all blocks."""
     tree: tuple[Int32[np.ndarray, "nodes 3"], Float32[np.ndarray, "nodes 4"]]
-    """Nodes, depth first: level (0: one block), the node that follows its last descendant, and its first block.
-    And the bounds of each: least and largest x, least and largest y."""
+    """Nodes of the tree, depth first: level (0: one block), the node that follows its last descendant, and its first
+    block. And the bounds of each node: least and largest x, least and largest y."""
 
     @classmethod
     def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> _Samples:
@@ -246,7 +246,7 @@ def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
 
 @compiled
 def _all(seen, nodes):  # pragma: no cover
-    """For `_next`: room for the triangles that may be seen at each level, and all triangles for the whole picture."""
+    """Room, for `_next`, for the triangles that may be seen at each level, and all triangles for the whole picture."""
     levels = nodes[0, 0] + 1 if len(nodes) > 0 else 1
     lists, lengths = np.empty((levels + 1, len(seen)), np.int32), np.zeros(levels + 1, np.int64)
     lists[levels], lengths[levels] = np.arange(len(seen)), len(seen)
@@ -401,7 +401,7 @@ def _places(x, y, hit, wanted, px, py, face, pixel, share):  # pragma: no cover
 
 @compiled
 def _look_up(texels, channel, start, side, s, t, count, value):  # pragma: no cover
-    """Bilinear in the level of side x side texels from `start` on, repeating at its borders."""
+    """Interpolates bilinearly in the level of side x side texels from `start` on, repeating at its borders."""
     for k in range(count):
         mask, scale = np.int32(side[k] - 1), np.float32(side[k])
         across, along = s[k] * scale - HALF, t[k] * scale - HALF

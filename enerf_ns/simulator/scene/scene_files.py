@@ -75,7 +75,7 @@ from enerf_ns.simulator.sources import linear_from_srgb
 from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 
 LARGEST_TEXTURE = 2048
-"""Texels along one side of a texture made from a picture, at most; less where there are more than eight pictures."""
+"""Most texels along one side of a texture made from a picture; less where there are more than eight pictures."""
 
 SHAPES = {"box": 3, "ball": 1, "plane": 2}
 """Shapes that need no file, with how many numbers their size has."""
@@ -86,10 +86,10 @@ GREY = 0.8
 IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".tga", ".gif"}
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""From the axes of glTF, whose y is up."""
+"""Pose that turns the axes of glTF, whose y is up, to axes whose z is up."""
 
 GLTF_FLOAT, GLTF_FAN = 5126, 6
-"""Component type and mode of a primitive, as glTF numbers them."""
+"""Component type of floats and mode of a fan of triangles, as glTF numbers them."""
 
 
 def load_scene(path: Path, rng: np.random.Generator, notes: list[str]) -> Scene:
@@ -117,18 +117,19 @@ class Piece:
     """Triangles with one texture, before light falls on them."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
-    """Corners in metres, counter-clockwise as seen from outside."""
+    """Corners of the triangles in metres, counter-clockwise as seen from outside."""
     normals: Float[np.ndarray, "faces 3 3"]
     """Unit vectors at the corners, outwards."""
     uv: Float[np.ndarray, "faces 3 2"]
-    """As in `Scene`."""
+    """Texture coordinates of the corners, as in `Scene`."""
     colour: Float[np.ndarray, "faces 3 channels"]
-    """Linear, at the corners; multiplies the image."""
+    """Linear colour at the corners; multiplies the image."""
     image: Float32[np.ndarray, "size size channels"] = field(default_factory=lambda: textures.plain()[..., None])
-    """As in `Surface`."""
+    """Linear brightness of the texture, as in `Surface`."""
 
     def moved(self, matrix: Float[np.ndarray, "4 4"]) -> Piece:
-        """In other axes, which may be stretched or mirrored; corners stay counter-clockwise as seen from outside."""
+        """The piece in other axes, which may be stretched or mirrored; corners stay counter-clockwise as seen from
+        outside."""
         normals = self.normals @ np.linalg.pinv(matrix[:3, :3])
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
@@ -138,7 +139,7 @@ class Piece:
         return replace(self, triangles=triangles, normals=-normals).inside_out()
 
     def inside_out(self) -> Piece:
-        """Its inside becomes its outside."""
+        """The piece turned inside out: its inside becomes its outside."""
         triangles, normals, uv, colour = (
             array[:, ::-1] for array in (self.triangles, -self.normals, self.uv, self.colour)
         )
@@ -357,7 +358,7 @@ def _piece(mesh: trimesh.Trimesh, images: dict[int, np.ndarray], is_gltf: bool) 
 
 
 def _picture(mesh: Any) -> Image.Image | None:
-    """Of the material of a mesh, if it has one."""
+    """Picture of the material of a mesh, if it has one."""
     material = getattr(getattr(mesh, "visual", None), "material", None)
     return getattr(material, "baseColorTexture", getattr(material, "image", None))
 
@@ -377,7 +378,7 @@ def _fractions(colours: ArrayLike | None) -> Float[np.ndarray, "*batch 3"]:
 
 
 def _one_or_three(colours: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch channels"]:
-    """One channel where all colours are grey."""
+    """The colours, in one channel where all of them are grey."""
     return colours[..., :1] if (colours == colours[..., :1]).all() else colours
 
 
@@ -391,7 +392,7 @@ def linear_image(
 
 
 def _with_area(piece: Piece) -> Piece:
-    """Without triangles that are a line or a point, or whose numbers are not finite."""
+    """The piece without triangles that are a line or a point, or whose numbers are not finite."""
     longest = np.linalg.norm(piece.triangles - np.roll(piece.triangles, 1, axis=1), axis=2).max(1)
     with np.errstate(invalid="ignore"):
         kept = (doubled_areas(piece.triangles) > 1e-7 * longest**2) & np.isfinite(piece.uv).all((1, 2))

@@ -26,39 +26,40 @@ class Scene:
     """Diffuse triangles whose brightness does not depend on the direction they are seen from."""
 
     triangles: Float32[np.ndarray, "faces 3 3"]
-    """Corners in metres."""
+    """Corners of the triangles in metres."""
     uv: Float32[np.ndarray, "faces 3 2"]
     """Texture coordinates of the corners: to the right and downwards, 1 is once across the texture, which repeats."""
     shade: Float32[np.ndarray, "faces 3 channels"]
     """Light and colour at the corners, at least 0; brightness is shade times texture. One channel is grey, three are
     linear red, green and blue."""
     texture: Int64[np.ndarray, " faces"]
-    """Which texture."""
+    """Number of each face's texture."""
     texels: Float32[np.ndarray, "texels channels"]
-    """Linear brightness, the mip pyramids of all textures (see `textures.mip_pyramid`) one after the other."""
+    """Linear brightness of the texels: the mip pyramids of all textures (see `textures.mip_pyramid`), one after the
+    other."""
     texture_start: Int64[np.ndarray, " textures"]
     """First row of each texture in `texels`."""
     texture_size: Int64[np.ndarray, " textures"]
     """Texels along one side of each texture's finest level, a power of two; 1 for a surface of one colour."""
     texels_per_metre: Float32[np.ndarray, " faces"]
-    """Of the finest level on each face; 0 where the whole face has one texture coordinate."""
+    """Texels per metre of the finest level on each face; 0 where the whole face has one texture coordinate."""
     camera: Float64[np.ndarray, "3"]
     """Where the camera stands on average, in metres."""
     target: Float64[np.ndarray, "3"]
-    """What it looks at."""
+    """What the camera looks at, in metres."""
     background: float = 0.0
     """Brightness where a ray hits nothing."""
 
     @property
     def channels(self) -> int:
-        """1 for grey, 3 for linear red, green and blue."""
+        """Number of colour channels: 1 for grey, 3 for linear red, green and blue."""
         return self.texels.shape[1]
 
     def grey(self) -> Scene:
-        """The scene as a grey camera sees it: with the luma of its colours (see `event_camera`) instead of them.
+        """The scene as a grey camera sees it: with the luma of its colours (see `response.luma`) instead of them.
 
-        That of a product of two colours, of a texture's and a corner's, is taken to be that of the one times that of
-        the other.
+        The luma of a product of two colours, of a texture's and a corner's, is taken to be the luma of the one times
+        the luma of the other.
         """
         if self.channels == 1:
             return self
@@ -71,11 +72,11 @@ class Surface:
     """Triangles with one texture; of its arrays some may be grey and others have three channels."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
-    """Corners in metres."""
+    """Corners of the triangles in metres."""
     uv: Float[np.ndarray, "faces 3 2"]
-    """As in `Scene`."""
+    """Texture coordinates of the corners, as in `Scene`."""
     shade: Float[np.ndarray, "faces 3 channels"]
-    """As in `Scene`."""
+    """Light and colour at the corners, as in `Scene`."""
     image: Float[np.ndarray, "size size channels"]
     """Linear brightness of the texture; `size` is a power of two."""
 
@@ -236,8 +237,8 @@ def corner_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 3"]:
 def texture_coordinates(
     triangles: Float[np.ndarray, "faces 3 3"], face_normals: Float[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 3 2"]:
-    """To the right and downwards, in the unit of the corners, along the two axes that a face lies closest to: a texture
-    is upright and not mirrored from outside."""
+    """Texture coordinates to the right and downwards, in the unit of the corners, along the two axes that a face lies
+    closest to: a texture is upright and not mirrored from outside."""
     across = np.abs(face_normals).argmax(1)
     faces = np.arange(len(across))
     outwards = np.sign(face_normals[faces, across]) * np.array([1, -1, 1])[across]

@@ -19,13 +19,13 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 SIZE = 1024
-"""Texels along one side of a texture, unless it says otherwise."""
+"""Texels along one side of a texture, unless the texture's description says otherwise."""
 TEXELS_PER_METRE = 256
 EXTENT = SIZE / TEXELS_PER_METRE
-"""Metres that such a texture covers before it repeats."""
+"""Metres that a texture of `SIZE` texels covers before it repeats."""
 
 Colour = Sequence[float]
-"""Red, green and blue in 0 to 255."""
+"""Red, green and blue, each from 0 to 255."""
 
 
 def plain() -> np.ndarray:
@@ -129,7 +129,7 @@ class _Map:
     """A picture of EXTENT by EXTENT metres to draw on; what leaves it at one border enters at the opposite one."""
 
     pixels: np.ndarray
-    """uint8 [size, size, 3]."""
+    """Texels of the picture, uint8 [size, size, 3]."""
 
     def area(self, corners: np.ndarray, colour: Colour) -> None:
         """Fills a polygon [N, 2]."""
@@ -403,11 +403,11 @@ class Procedural(NamedTuple):
     """How a texture is made by its name, and how it is put on a surface."""
 
     make: Callable[[np.random.Generator], np.ndarray]
-    """float32 [size, size] or [size, size, 3]."""
+    """Function that draws the texture, float32 [size, size] or [size, size, 3]."""
     extent: float | None
-    """Metres that it covers before it repeats; None: it is stretched once over a side."""
+    """Metres that the texture covers before it repeats; None: it is stretched once over a side."""
     brightness: tuple[float, float]
-    """Of its zeros and ones where none is asked for."""
+    """Brightness of the texture's zeros and ones where none is asked for."""
 
 
 PROCEDURAL = {

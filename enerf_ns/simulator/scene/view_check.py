@@ -18,28 +18,28 @@ from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.sources import RenderedScene
 
 PATH_STEP, MOST_PATH_STEPS = 2_000_000, 10_000
-"""Nanoseconds of the way that are taken for a straight line, and at most how many of these lines."""
+"""Nanoseconds of the camera's way that are taken for a straight line, and how many of these lines there are at most."""
 
 LOOK_STEP, MOST_LOOKS = 10_000_000, 1000
-"""Nanoseconds from one look at the scene to the next, and at most how many looks."""
+"""Nanoseconds from one look at the scene to the next, and how many looks there are at most."""
 
 FEWEST_STEPS = 50
-"""Lines and looks, at least."""
+"""How many lines the camera's way has, and how many looks there are, at least."""
 
 PLACES = 20
-"""Where all surfaces around the camera are looked for; in between, those that it passes through."""
+"""Number of places where all surfaces around the camera are looked for; in between, those that it passes through."""
 
 INSIDE = 0.5
 """Winding number above which a camera is inside; of a closed surface it is 1 there and 0 outside."""
 
 SAME_PLACE = 1e-6
-"""Of a line, between places at which it passes through surfaces."""
+"""Share of a line of the way within which the places where it passes through surfaces are taken for one."""
 
 PIXEL_STEP = 8
-"""Of all rows and columns, one of so many is looked along first."""
+"""Of this many rows or columns, one is looked along first."""
 
 GRID_BITS = 21
-"""Corners are one if they are the same in so many bits of each coordinate."""
+"""Number of bits of each coordinate; corners that are the same in these are taken for one."""
 
 
 def check_view(name: str, what: str, source: RenderedScene, start: int, end: int, notes: list[str]) -> None:
@@ -169,7 +169,7 @@ class _Parts:
 
 
 def _crossings(parts: _Parts, positions: Float64[np.ndarray, "positions 3"]) -> list[tuple[float, int]]:
-    """Where on the way from position to position, 0.5 is halfway to the second, which parts are passed through."""
+    """Which parts are passed through where on the way from position to position; 0.5 is halfway to the second."""
     lower, upper = parts.triangles.min(1), parts.triangles.max(1)
     near = ((lower <= positions.max(0)) & (upper >= positions.min(0))).all(1)
     triangles, number, lower, upper = parts.triangles[near], parts.number[near], lower[near], upper[near]
@@ -200,7 +200,7 @@ def _passed(
 
 
 def _position(positions: Float64[np.ndarray, "positions 3"], at: float) -> Float64[np.ndarray, "3"]:
-    """Where on the way from position to position; 0.5 is halfway to the second."""
+    """Position at a place of the way from position to position; 0.5 is halfway to the second."""
     return np.array([np.interp(at, np.arange(len(positions)), axis) for axis in positions.T])
 
 
@@ -209,7 +209,7 @@ def _poses(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float6
 
 
 def _longest(mask: Bool[np.ndarray, " times"]) -> tuple[int, int]:
-    """First and last index of the longest run."""
+    """First and last index of the longest run of times at which a mask is true."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
     first, after = edges[np.argmax(np.diff(edges, axis=1))].tolist()
     return first, after - 1
