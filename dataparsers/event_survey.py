@@ -32,7 +32,7 @@ class Survey:
     counts: Int32[np.ndarray, " pixels"]
     """Events of each pixel from start to end."""
     num_events: int = 0
-    """Number of events of the whole recording."""
+    """Number of events of the whole recording; of one with a faulty event, of the pieces before that event's."""
     first: int = 0
     """Time of the first event of the recording, ns."""
     last: int = 0
@@ -96,7 +96,6 @@ def survey_events(stream: EventStream, width: int, height: int, start: int, end:
             survey.outside, survey.backwards, survey.odd_polarity = (number if fault == i else None for i in (1, 2, 3))
             x, y, t, p = (int(column[place]) for column in (events.x, events.y, events.t, events.p))
             survey.odd_event = x, y, t, p
-            survey.last = int(state[0])
             break
         survey.num_events += len(events)
     survey.last = int(state[0])

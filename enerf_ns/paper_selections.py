@@ -318,8 +318,8 @@ def selections(
     Args:
         name: Of the preset.
         recording: The sequence of the preset, with all its frames.
-        parser: What the user set; of frames that he chose for one use, none is selected for the other, and where he
-            holds out every so many, none is selected at all.
+        parser: What the user set; of frames that they chose for one use, none is selected for the other, and where
+            they hold out every so many, none is selected at all.
         paper_batch: Whether the batch sizes are the paper's; with them a step of the method enerf takes some twenty
             times as long.
 

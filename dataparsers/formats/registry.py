@@ -25,13 +25,15 @@ def register(format: Format) -> None:
     """Makes a format known: it is found out from folders, and can be named.
 
     Args:
-        format: Its name and its command are those of no other.
+        format: Its name and its command are those of no other, and the name is not auto.
 
     Raises:
-        ValueError: There is a format of this name or command already.
+        ValueError: There is a format of this name or command already, or the name means that it be found out.
     """
     taken = {name for known in formats() for name in (known.name, known.command)}
-    if format.name in taken or format.command in taken or format.name == "auto":
+    if format.name == "auto":
+        raise ValueError("A format cannot be named auto, which means that it is found out; give it another name.")
+    if format.name in taken or format.command in taken:
         raise ValueError(f"There is a format {format.name} or {format.command} already; give this one other names.")
     _FORMATS[format.name] = format
 

@@ -105,10 +105,15 @@ def test_a_format_from_outside_is_found_and_named(basket: Path):
     assert event_dataparser.basket_events.config == config  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("taken", [{"name": "esim"}, {"command": "eds-events"}, {"name": "auto"}])
+@pytest.mark.parametrize("taken", [{"name": "esim"}, {"command": "eds-events"}])
 def test_names_that_are_taken_are_refused(basket: Path, taken: dict):
     with pytest.raises(ValueError, match="already; give this one other names"):
         register(replace(BASKET, **{"name": "new", "command": "new-events", **taken}))
+
+
+def test_no_format_is_named_as_the_search_for_one(basket: Path):
+    with pytest.raises(ValueError, match="^A format cannot be named auto, which"):
+        register(replace(BASKET, name="auto", command="auto-events"))
 
 
 def test_values_that_do_not_check_as_sound_are_named_by_the_folder(basket: Path):
@@ -137,7 +142,7 @@ def test_flags_are_made_from_the_options_of_all_formats(basket: Path, capsys: py
         tyro.cli(flags, args=["--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "For a recording of basket: Which of the baskets is read. None: red." in shown
-    assert "For a recording of tum_vie: Which of the two event cameras, with the frame camera beside it." in shown
+    assert "For a recording of tum_vie: Which of the two event cameras is read, with the frame camera beside it." in shown
 
 
 def test_a_layout_that_can_only_be_read():
