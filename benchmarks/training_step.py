@@ -2,7 +2,8 @@
 
     python benchmarks/training_step.py RECORDING
 
-Prints a Markdown table: median milliseconds of `next_train` and of the whole step of the method `enerf`.
+Prints a Markdown table: median milliseconds of drawing a batch with its rays, and of the whole step of the method
+`enerf`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Annotated
 import torch
 import tyro
 
+from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.runs import method_config, set_up
 
 
@@ -38,9 +40,14 @@ class TrainingStep:
             with tempfile.TemporaryDirectory() as folder:
                 changes = {"pipeline.datamanager.event_pairs": pairs}
                 trainer = set_up(method_config("enerf", self.data, Path(folder), changes))
-                sampling = self.median_ms(lambda trainer=trainer: trainer.pipeline.datamanager.next_train(0))
+                sampling = self.median_ms(lambda pipeline=trainer.pipeline: self.draw(pipeline))
                 step = self.median_ms(lambda trainer=trainer: trainer.train_iteration(0))
             print(f"| {pairs} | {sampling:.1f} | {step:.0f} | {100 * sampling / step:.1f} % |", flush=True)
+
+    @staticmethod
+    def draw(pipeline: EnerfPipeline) -> None:
+        manager, sensor = pipeline.datamanager, pipeline.model.sensor
+        manager.rays(manager.next_batch(sensor), sensor)
 
     def median_ms(self, call: Callable) -> float:
         """Median wall time of a call, after two that warm up."""
