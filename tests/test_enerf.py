@@ -188,7 +188,7 @@ def test_parameters_that_do_not_fit_are_an_error(trained: Any, change, strict: b
 def test_a_checkpoint_of_an_earlier_version_fits(trained: Any):
     """It spells the colour network another way, and is the same otherwise."""
     pipeline = copy.deepcopy(trained.pipeline)
-    state = {name.replace("colour", "color"): value for name, value in pipeline.state_dict().items()}
+    state = {name.replace("colour", "color"): value.clone() for name, value in pipeline.state_dict().items()}
     assert set(state) != set(pipeline.state_dict())
     for parameter in pipeline.model.parameters():
         torch.nn.init.zeros_(parameter)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.event_dataparser import specification
+from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import read_recording, register
 from enerf_ns.dataparsers.indexing import index_events
@@ -40,7 +42,6 @@ def read_two_arrays(folder: Path) -> EventRecording:
 
 
 TWO_ARRAYS = Format("two_arrays", "two-arrays", "Two arrays.", ("events.npy", "poses.npy"), read_two_arrays)
-register(TWO_ARRAYS)
 two_arrays = specification(TWO_ARRAYS)
 """What an entry point of the group nerfstudio.dataparser_configs names, for `ns-train enerf two-arrays --data ...`."""
 
@@ -48,9 +49,6 @@ two_arrays = specification(TWO_ARRAYS)
 def cauchy_loss(predicted: Tensor, measured: Tensor, mean_threshold: float | Tensor) -> Tensor:
     """A loss that counts wrong pairs even less than Huber's."""
     return torch.log1p(((predicted - measured) / mean_threshold) ** 2).mean()
-
-
-EVENT_LOSSES["cauchy"] = cauchy_loss
 
 
 class LearnedRatio(SensorModel):
@@ -69,6 +67,16 @@ class LearnedRatio(SensorModel):
 @dataclasses.dataclass
 class LearnedRatioConfig(SensorModelConfig):
     _target: type[SensorModel] = dataclasses.field(default_factory=lambda: LearnedRatio)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def added() -> Iterator[None]:
+    """The reader and the loss, known until the tests of this module have ended."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_FORMATS", dict(registry._FORMATS))
+        register(TWO_ARRAYS)
+        patch.setitem(EVENT_LOSSES, "cauchy", cauchy_loss)
+        yield
 
 
 @pytest.fixture(scope="module")
