@@ -330,16 +330,13 @@ def selections(
         RecordingError: The recording has not the frames that the preset selects.
     """
     preset = PRESETS[name]
+    train = without(preset.train_frames, parser.held_out_frame_indices or ())
+    held_out = without(preset.held_out_frames, parser.train_frame_indices or ())
     values: dict[str, Any] = {}
     if parser.held_out_every is None:
-        values["datamanager.dataparser.train_frame_indices"] = without(
-            preset.train_frames, parser.held_out_frame_indices or ()
-        )
-        values["datamanager.dataparser.held_out_frame_indices"] = without(
-            preset.held_out_frames, parser.train_frame_indices or ()
-        )
-    train = parser.train_frame_indices or without(preset.train_frames, parser.held_out_frame_indices or ())
-    held_out = parser.held_out_frame_indices or without(preset.held_out_frames, parser.train_frame_indices or ())
+        values["datamanager.dataparser.train_frame_indices"] = train
+        values["datamanager.dataparser.held_out_frame_indices"] = held_out
+    train, held_out = parser.train_frame_indices or train, parser.held_out_frame_indices or held_out
     frames = recording.frames or recording.blurred_frames
     numbers = frames.numbers.tolist() if frames else []
     with_pose = [number for number in train if number in numbers]

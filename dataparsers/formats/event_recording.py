@@ -130,7 +130,7 @@ def write(recording: EventRecording, folder: Path) -> int:
         raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
     sensor = recording.contrast_thresholds, recording.refractory_period, recording.bayer_pattern, recording.response
     frame_camera = frame_cameras[0] if frame_cameras else None
-    about = _encode_about(recording.camera, frame_camera, *sensor, depth_range=recording.depth_range)
+    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range)
     write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
@@ -345,8 +345,8 @@ def _encode_about(
     contrast_thresholds: tuple[float, float] | None,
     refractory_period: int,
     bayer_pattern: str | None,
-    response: str | None = None,
-    depth_range: tuple[float, float] | None = None,
+    response: str | None,
+    depth_range: tuple[float, float] | None,
 ) -> bytes:
     """recording.json, in which what is not known is left out."""
     about = {
@@ -456,8 +456,8 @@ class EventRecordingWriter(Writer):
         setup = self.setup
         rig = setup.event_camera, setup.frame_camera, setup.event_from_frame
         frame_camera = mounted_camera_json(*rig[1:]) if is_second_camera(*rig) else None
-        sensor = setup.contrast_thresholds, setup.refractory_period, setup.bayer_pattern
-        self._replace("recording.json", _encode_about(rig[0], frame_camera, *sensor, depth_range=self.depth_range))
+        sensor = setup.contrast_thresholds, setup.refractory_period, setup.bayer_pattern, setup.response
+        self._replace("recording.json", _encode_about(rig[0], frame_camera, *sensor, self.depth_range))
 
     def _write_poses(self, trajectory: Trajectory) -> None:
         write_poses(self.folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)

@@ -237,6 +237,13 @@ def test_every_layout_is_written_and_read_back(tmp_path):
     assert (tmp_path / "own/preview.mp4").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("response", ["linlog", "logarithm:0.01"])
+def test_the_response_is_stated_where_the_layout_has_a_place_for_it(tmp_path, response):
+    sensor = SensorSettings(response=response)
+    simulate(SimulationSettings("roads", layout="event_recording", sensor=sensor, **SHORT), tmp_path / "new")
+    assert read_recording(tmp_path / "new").response == response
+
+
 def test_a_video_of_pictures_makes_events(tmp_path):
     (tmp_path / "pictures").mkdir()
     for k in range(5):
