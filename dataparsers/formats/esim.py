@@ -172,6 +172,8 @@ class EsimWriter(Writer):
     """Writer of E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
 
     layout = "esim"
+    frame_folders = ("images", "images_corrupted")
+    stamps_name = "image_stamps_ns.txt"
     fewest_frames = 11
 
     def _check(self) -> None:
@@ -215,19 +217,10 @@ class EsimWriter(Writer):
         return IntervalFiles([self.folder / path for path in paths], self.setup.frame_times)
 
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
-        images = {f"images/{self._name(number)}.png": in_colour(sharp)}
-        if blurred is not None:
-            images[f"images_corrupted/{self._name(number)}.png"] = in_colour(blurred)
-        return images
+        return super()._images(number, in_colour(sharp), None if blurred is None else in_colour(blurred))
 
-    def _stamps(self, time: int) -> dict[str, str]:
-        folders = ("images", "images_corrupted") if self.setup.exposure else ("images",)
-        return {f"{folder}/image_stamps_ns.txt": f"{time}\n" for folder in folders}
-
-    def _write_summary(self, finished: bool) -> None:
-        if self.depth_range is not None:
-            self._write_bounds()
-        super()._write_summary(finished)
+    def _write_depth_range(self) -> None:
+        self._write_bounds()
 
 
 class IntervalFiles:

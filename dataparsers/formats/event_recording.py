@@ -440,6 +440,8 @@ class EventRecordingWriter(Writer):
     """Writer of this project's own layout."""
 
     layout = "event_recording"
+    frame_folders = ("frames", "blurred_frames")
+    stamps_name = "stamps_ns.txt"
 
     def _check(self) -> None:
         if self.setup.frame_camera.model == "lookup":
@@ -465,20 +467,8 @@ class EventRecordingWriter(Writer):
     def _open_events(self) -> EventFiles:
         return _ColumnFiles(self.folder / "events")
 
-    def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
-        images = {f"frames/{self._name(number)}.png": sharp}
-        if blurred is not None:
-            images[f"blurred_frames/{self._name(number)}.png"] = blurred
-        return images
-
-    def _stamps(self, time: int) -> dict[str, str]:
-        folders = ("frames", "blurred_frames") if self.setup.exposure else ("frames",)
-        return {f"{folder}/stamps_ns.txt": f"{time}\n" for folder in folders}
-
-    def _write_summary(self, finished: bool) -> None:
-        if self.depth_range is not None:
-            self._write_about()
-        super()._write_summary(finished)
+    def _write_depth_range(self) -> None:
+        self._write_about()
 
 
 class _ColumnFiles:

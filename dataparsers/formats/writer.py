@@ -95,6 +95,10 @@ class Writer(ABC):
     """Poses a second, as many as the data set has, where it has a fixed number."""
     published_rig: ClassVar[Rig | None] = None
     """The cameras of the data set, where it has its own."""
+    frame_folders: ClassVar[tuple[str, str]]
+    """Folders of the sharp and of the blurred frames, of layouts that have one for each."""
+    stamps_name: ClassVar[str]
+    """Name of the table of stamps in each of those."""
     events_held: ClassVar[int] = 2**16
     """Events that are held back until they are written, and those in a chunk of an HDF5 file."""
 
@@ -211,13 +215,18 @@ class Writer(ABC):
     @abstractmethod
     def _open_events(self) -> EventFiles: ...
 
-    @abstractmethod
+    def _write_depth_range(self) -> None:  # noqa: B027  (a layout that states no range does nothing)
+        """Writes what states the range of depth, where the layout does; called when there is one, and at the end."""
+
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
         """The images of a frame, by path."""
+        images = zip(self.frame_folders, (sharp, blurred), strict=True)
+        return {f"{folder}/{self._name(number)}.png": image for folder, image in images if image is not None}
 
-    @abstractmethod
     def _stamps(self, time: int) -> dict[str, str]:
         """What each table of frames gets for one at this time (ns), by path."""
+        folders = self.frame_folders if self.setup.exposure else self.frame_folders[:1]
+        return {f"{folder}/{self.stamps_name}": f"{time}\n" for folder in folders}
 
     def _name(self, number: int) -> str:
         """Name of a frame's files, such that they sort as their numbers do."""
@@ -233,6 +242,8 @@ class Writer(ABC):
 
     def _write_summary(self, finished: bool) -> None:
         setup = self.setup
+        if self.depth_range is not None:
+            self._write_depth_range()
         summary = {
             **setup.settings,
             "layout": self.layout,
