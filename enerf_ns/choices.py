@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+
 from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig
@@ -22,6 +24,7 @@ from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
+from enerf_ns.events.statistics import border_rate, silent_share
 from enerf_ns.paper_selections import preset_named, selections
 from enerf_ns.sensor.response import ColourFilter, response_named
 from enerf_ns.sensor.sensor_model import GREY, thresholds_from_polarity
@@ -49,6 +52,25 @@ DEFAULT_SILENCE_MS = 20.0
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""
 
+MOST_LEVELS = 10
+"""Most levels that are chosen for the hash grid."""
+
+SMALLEST_GROWTH = 1.4
+"""Least factor by which a level of the hash grid is finer than the one before; closer ones hold nearly the same."""
+
+SEEN_AROUND = math.radians(30)
+"""Angle (rad) over which the middle of the scene must be seen before gloss is looked for: within less, what gloss adds
+looks like texture."""
+
+SMALLEST_GAIN = 0.02
+"""Least share by which a part must lower the error of held-out pairs to be kept."""
+
+SMALLEST_SILENT_SHARE = 0.01
+"""Least share of the time that pixels must be silent for silent pixels to be searched; below, hardly one is found."""
+
+SILENT_BORDER = 0.02
+"""Share of a sensor's mean events a pixel below which its border is silent, as around an object before nothing."""
+
 
 class PipelineConfig(Protocol):
     """The config of a pipeline, which is what gets resolved."""
@@ -69,6 +91,8 @@ class Choice:
     kept: bool
     value: str
     why: str
+    flag: str = ""
+    """Flag of `ns-train` by which it is forced; those of event-data come last on the command line."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +117,22 @@ class Resolution:
         return filled
 
 
-def resolve(config: PipelineConfig, recording: EventRecording, preset: str | None = None) -> Resolution:
+Probe = Callable[[Any], "tuple[float, float]"]
+"""What gains a part of the model: a function of the config of a pipeline, with all but that part decided, that gives by
+which share the part lowers the error of held-out pairs, and the standard error of that."""
+
+
+def resolve(
+    config: PipelineConfig, recording: EventRecording, preset: str | None = None, probe: Probe | None = None
+) -> Resolution:
     """Decides all that a config leaves open. Nothing is changed; the same arguments give the same answer.
 
     Args:
         config: What the user set, and None for the rest.
-        recording: What is learnt from. Its events are indexed only for what is open.
+        recording: What is learnt from.
         preset: A sequence of the paper whose selections are used.
+        probe: What letting brightness depend on the direction gains; asked where the camera goes around the scene.
+            None: nothing.
 
     Returns:
         What is used, and a row for each choice.
@@ -108,12 +141,12 @@ def resolve(config: PipelineConfig, recording: EventRecording, preset: str | Non
         RecordingError: The depth of the scene cannot be measured, or a preset selects frames that are not there.
         FlagError: A setting is out of its range, or asks for what the recording does not have.
     """
-    return _Resolver(config, recording, preset).resolution()
+    return _Resolver(config, recording, preset, probe).resolution()
 
 
 class _Resolver:
-    def __init__(self, config: PipelineConfig, recording: EventRecording, preset: str | None):
-        self.config = config
+    def __init__(self, config: PipelineConfig, recording: EventRecording, preset: str | None, probe: Probe | None):
+        self.config, self.probe = config, probe
         self.values: dict[str, Any] = {}
         self.choices: list[Choice] = []
         self.selection: list[str] = []
@@ -124,6 +157,14 @@ class _Resolver:
             self._note_flags()
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
         self.recording = recording.selected(time_range, self.parser.keep_hot_pixels)
+
+    @property
+    def use_events(self) -> bool:
+        return "events" in self.config.datamanager.supervision
+
+    @property
+    def use_frames(self) -> bool:
+        return "frames" in self.config.datamanager.supervision
 
     @property
     def parser(self) -> EventDataParserConfig:
@@ -147,15 +188,26 @@ class _Resolver:
             return "set by flag"
         return "the preset states it" if name in self.preset_values else otherwise
 
-    def row(self, part: str, kept: bool, value: str, why: str) -> None:
-        self.choices.append(Choice(part, kept, value, why))
+    def row(self, part: str, kept: bool, value: str, why: str, name: str) -> None:
+        """Adds a choice.
+
+        Args:
+            part, kept, value, why: As of `Choice`.
+            name: Of the setting that forces it, within the config of the pipeline.
+        """
+        prefix, _, setting = name.rpartition(".")
+        prefix = {DATAPARSER: "event-data --", "model.sensor": "--pipeline.model."}.get(prefix, f"--pipeline.{prefix}.")
+        self.choices.append(Choice(part, kept, value, why, prefix + setting.replace("_", "-")))
 
     def resolution(self) -> Resolution:
         self._split()
         self._events()
+        self._silent_pixels()
         self._sensor()
-        self._supervision()
-        self._field()
+        self._frames()
+        self._colour()
+        self._scene()
+        self._gloss()
         return Resolution(self.values, tuple(self.choices), tuple(self.selection))
 
     def _note_flags(self) -> None:
@@ -197,8 +249,8 @@ class _Resolver:
         if blind < 0:
             raise FlagError(f"--refractory-period-ns is {blind}, but it must be at least 0.")
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
-        if "events" not in data.supervision:
-            self.row("event loss", False, "", f"supervision is {data.supervision}")
+        if not self.use_events:
+            self.row("event loss", False, "", f"supervision is {data.supervision}", "datamanager.supervision")
             return
         values = {
             "successor": "each event with the pixel's next",
@@ -206,15 +258,36 @@ class _Resolver:
             "window": f"each event with the pixel's last in {data.window_ms:g} ms",
         }
         why = "learns from events"
-        if blind:
-            why += f"; pixels are blind for {blind * 1e-6:g} ms after an event"
-            if mode != "successor":
-                why += ", for which only datamanager.pair-mode successor is exact"
-        self.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why)
+        if blind and mode != "successor":
+            why += "; while pixels are blind after an event, only datamanager.pair-mode successor is exact"
+        self.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why, "datamanager.supervision")
+
+    def _silent_pixels(self) -> None:
+        """Whether pixels that stay silent are learnt from, and how."""
+        defaults, name = self.config.defaults, "datamanager.silent_pairs"
+        loss = self.use("model.event_loss", lambda: defaults.event_loss)
+        if loss not in EVENT_LOSSES:
+            raise FlagError(
+                f"--pipeline.model.event-loss is {loss!r}, but one of {', '.join(EVENT_LOSSES)} was expected."
+            )
+        self.use("model.no_event_loss_weight", lambda: defaults.no_event_loss_weight)
+        self.use("model.no_event_margin", lambda: defaults.no_event_margin)
+        silence = self.use("datamanager.silence_ms", lambda: DEFAULT_SILENCE_MS)
+        if not self.use_events:
+            self.use(name, lambda: 0)
+            self.row("silent pixels", False, "", "no events are used", "datamanager.supervision")
+            return
+        share = silent_share(index_events(self.recording), round(silence * 1e6))
+        silent_pairs = self.use(name, lambda: defaults.silent_pairs if share > SMALLEST_SILENT_SHARE else 0)
+        value = f"{silent_pairs} pairs a step" if silent_pairs else "they are not searched"
+        why = f"pixels are silent for {silence:g} ms and longer during {100 * share:.1f} % of the time"
+        if not defaults.silent_pairs:
+            why = "the method does without"
+        self.row("silent pixels", bool(silent_pairs), value, self.why(name, why), name)
 
     def _sensor(self) -> None:
         """What the sensor is like that made the events."""
-        recording, use_events = self.recording, "events" in self.config.datamanager.supervision
+        recording = self.recording
         name = "model.sensor.contrast_thresholds"
         counts = None
 
@@ -226,19 +299,26 @@ class _Resolver:
             counts = index.num_positive, len(index) - index.num_positive
             return thresholds_from_polarity(*counts)
 
-        thresholds = self.use(name, from_recording)
-        if not min(thresholds) > 0.0:
-            raise FlagError(f"--contrast-thresholds are {tuple(thresholds)}, but both must be above 0")
+        on, off = self.use(name, from_recording)
+        if not min(on, off) > 0.0:
+            raise FlagError(f"--contrast-thresholds are {(on, off)}, but both must be above 0")
         why = "the recording states them"
         if counts is not None:
             why = f"{counts[0]:,} on and {counts[1]:,} off events; their mean is assumed"
-        self.row("contrast thresholds", use_events, "on {:.3f}, off {:.3f}".format(*thresholds), self.why(name, why))
+        value = f"on {on:.3f}, off {off:.3f}" if on != off else f"{on:.3f} for both"
+        self.row("threshold per polarity", self.use_events and on != off, value, self.why(name, why), name)
+
+        name = "model.sensor.refractory_period_ns"
+        blind = self.use(name, lambda: recording.refractory_period)
+        value = f"blind for {blind * 1e-6:g} ms after an event" if blind else ""
+        why = "the recording states it" if blind else "the recording states none"
+        self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
 
         name = "model.sensor.response"
         response = self.use(name, lambda: recording.response or "linlog")
         _check("--pipeline.model.response", lambda: response_named(response))
         why = "the recording states it" if recording.response else "the response of E-NeRF"
-        self.row("response", use_events, response, self.why(name, why))
+        self.row("response", self.use_events, response, self.why(name, why), name)
 
         name = "model.sensor.bayer_pattern"
         pattern = self.use(name, lambda: recording.bayer_pattern or GREY)
@@ -246,91 +326,132 @@ class _Resolver:
         if pattern != GREY:
             _check("--pipeline.model.bayer-pattern", lambda: ColourFilter(pattern, recording.camera.width))
 
-    def _supervision(self) -> None:
-        """Which losses there are."""
-        data, model, defaults, recording = (
-            self.config.datamanager, self.config.model, self.config.defaults, self.recording,
-        )  # fmt: skip
-        use_events, use_frames = "events" in data.supervision, "frames" in data.supervision
-        loss = self.use("model.event_loss", lambda: defaults.event_loss)
-        if loss not in EVENT_LOSSES:
-            raise FlagError(
-                f"--pipeline.model.event-loss is {loss!r}, but one of {', '.join(EVENT_LOSSES)} was expected."
-            )
-        self.use("model.no_event_loss_weight", lambda: defaults.no_event_loss_weight)
-        self.use("model.no_event_margin", lambda: defaults.no_event_margin)
-        silent_pairs = self.use("datamanager.silent_pairs", lambda: defaults.silent_pairs)
-        self.use("datamanager.silence_ms", lambda: DEFAULT_SILENCE_MS)
-        if use_events and silent_pairs:
-            self.row(
-                "no-event loss", True, f"{silent_pairs} silent pairs a step", "keeps surfaces without texture even"
-            )
-        else:
-            why = (
-                "datamanager.silent-pairs is 0; silent pixels are not searched" if use_events else "no events are used"
-            )
-            self.row("no-event loss", False, "", why)
+    def _frames(self) -> None:
+        """Whether frames are learnt from, and whether a second camera took them."""
+        data, recording, name = self.config.datamanager, self.recording, "datamanager.supervision"
+        self.use("datamanager.train_num_rays_per_batch", lambda: self.config.defaults.train_num_rays_per_batch)
+        if not self.use_frames:
+            why = f"supervision is {data.supervision}" if recording.has_frames else "the recording holds no frames"
+            self.row("frame loss", False, "", why, name)
+            return
+        blurred = self.parser.train_frames == "blurred" and recording.blurred_frames is not None
+        what = "blurred frames" if blurred else "sharp frames"
+        self.row("frame loss", True, what, f"supervision is {data.supervision}", name)
+        frames = recording.blurred_frames if blurred else recording.frames
+        if frames is not None and self.use_events:
+            second = frames.trajectory is not recording.trajectory or frames.camera != recording.camera
+            value = f"{frames.camera.width} x {frames.camera.height}, {frames.camera.model}" if second else ""
+            why = "the calibration states it" if second else "frames and events are of one camera"
+            self.row("second camera", second, value, why, name)
 
-        self.use("datamanager.train_num_rays_per_batch", lambda: defaults.train_num_rays_per_batch)
-        if use_frames:
-            blurred = self.parser.train_frames == "blurred" and recording.blurred_frames is not None
-            what = "blurred frames" if blurred else "sharp frames"
-            self.row("frame loss", True, what, f"supervision is {data.supervision}")
-        else:
-            why = "supervision is events; add frames by datamanager.supervision events+frames"
-            self.row("frame loss", False, "", why if recording.has_frames else "the recording holds no frames")
-
-        pattern = model.sensor.bayer_pattern or self.values["model.sensor.bayer_pattern"]
-        colour_events = use_events and pattern != GREY
-        if colour_events and model.num_channels == 1:
+    def _colour(self) -> None:
+        """How many colour channels the field has."""
+        recording, name = self.recording, "model.num_channels"
+        pattern = self.config.model.sensor.bayer_pattern or self.values["model.sensor.bayer_pattern"]
+        colour_events = self.use_events and pattern != GREY
+        if colour_events and self.config.model.num_channels == 1:
             raise FlagError(
                 f"{recording.path}: the sensor has a colour filter ({pattern}), but "
                 "--pipeline.model.num-channels is 1; leave that flag out, or set it to 3"
             )
         frames = recording.blurred_frames or recording.frames
         channels = self.use(
-            "model.num_channels",
+            name,
             lambda: (
                 3
-                if colour_events or (use_frames and frames is not None and is_colour(load_image(frames.filenames[0])))
+                if colour_events
+                or (self.use_frames and frames is not None and is_colour(load_image(frames.filenames[0])))
                 else 1
             ),
         )
         why = "the field learns from colour frames" if channels == 3 else "nothing here is in colour"
         if colour_events:
             why = f"the sensor has a colour filter ({pattern})"
-        self.row("colour", channels == 3, f"{channels} channel(s)", self.why("model.num_channels", why))
+        self.row("colour", channels == 3, f"{channels} channel(s)", self.why(name, why), name)
 
-    def _field(self) -> None:
-        """What the field is like, and the box that it fills."""
+    def _scene(self) -> None:
+        """Where the scene lies, and how finely it is looked at."""
         model, recording = self.config.model, self.recording
         lens = recording.camera.model
-        self.row("undistortion", lens != "pinhole", lens, "the calibration states it")
-        why = "model.view-direction" + ("" if model.view_direction else " is off: brightness as of matt surfaces")
-        self.row("view direction", model.view_direction, "", why)
+        self.row("undistortion", lens != "pinhole", lens, "the calibration states it", f"{DATAPARSER}.undistort")
 
         name = f"{DATAPARSER}.depth_range"
         box = self.use(f"{DATAPARSER}.box", lambda: None)
         stated = self.use(name, lambda: None)
-        near, far = scene_depth_range(recording, stated)
+        near, far = self._depth_range = scene_depth_range(recording, stated)
         if stated is None:
             self.values[name] = near, far
         _, scale, _ = scene_normalisation(recording, near, far, box)
         if box is None:
-            value = f"box of depths {near:.2f} m to {far:.2f} m"
-            why = "the recording states it" if recording.depth_range else "measured from events and poses"
-            why = self.why(name, why)
+            value = f"depths {near:.2f} m to {far:.2f} m"
+            why = self.why(name, "the recording states them" if recording.depth_range else "measured from the events")
         else:
-            value, why = f"cube of {2 * box[3]:g} m", self.why(f"{DATAPARSER}.box", "")
-        self.row("contraction", False, value, why)
-
+            name = f"{DATAPARSER}.box"
+            value, why = f"cube of {2 * box[3]:g} m", self.why(name, "")
+        self.row("box", True, value, why, name)
         self.use("model.near_plane", lambda: near * scale)
+
         footprint = math.sqrt(near * far) / recording.camera.fx * scale
         finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
-        name = "model.max_res"
-        resolution = self.use(name, lambda: min(max(finest, 2 * model.base_res), LARGEST_RESOLUTION))
-        levels = f"{model.num_levels} levels, {model.base_res} to {resolution} cells"
-        self.row("hash grid", True, levels, self.why(name, "sensor's pixels"))
+        resolution = self.use("model.max_res", lambda: min(max(finest, 2 * model.base_res), LARGEST_RESOLUTION))
+        name = "model.num_levels"
+        ratio = max(resolution / model.base_res, 1.0)
+        levels = self.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
+        growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
+        why = f"as fine as the sensor's pixels, each {growth:.2f} times as fine as the one before"
+        if model.max_res is not None:
+            why = "set by flag"
+        self.row(
+            "hash grid", True, f"{levels} levels, {model.base_res} to {resolution} cells", self.why(name, why), name
+        )
+
+        name = "model.sampling"
+        disparity = recording.camera.fx * _path_extent(recording) * (1 / near - 1 / far)
+        sampling = self.use(name, lambda: "proposal" if disparity > model.num_samples else "uniform")
+        value = f"{model.num_proposal_samples} + {model.num_samples} samples a ray"
+        if sampling == "uniform":
+            value = f"{model.num_samples} samples a ray, evenly spaced"
+        why = f"the path moves the nearest point by {disparity:.0f} pixels against the farthest"
+        why += ", more than there are samples" if disparity > model.num_samples else ": a sample for each pixel"
+        self.row("proposal network", sampling == "proposal", value, self.why(name, why), name)
+
+        name = "model.opacity_loss_weight"
+        why, before_nothing = "learns from frames alone", False
+        if self.use_events:
+            share = border_rate(index_events(recording), recording.camera.height)
+            before_nothing = share < SILENT_BORDER
+            what = "an object before nothing" if before_nothing else "rays meet surfaces there too"
+            why = f"pixels at the sensor's border fired {share:.2g} times as often as the others: {what}"
+        weight = self.use(name, lambda: 0.0 if before_nothing else 1.0)
+        self.row("opacity loss", bool(weight), f"weight {weight:g}" if weight else "", self.why(name, why), name)
+
+    def _gloss(self) -> None:
+        """Whether brightness depends on the direction from which a point is seen."""
+        name, width = "model.view_direction", _angle_of_view(self.recording, *self._depth_range)
+        why = f"the camera goes {math.degrees(width):.0f} degrees around the scene"
+        kept = attrgetter(name)(self.config)
+        if kept is None and width < SEEN_AROUND:
+            why += ", too little to tell gloss from texture"
+        elif kept is None and self.probe is None:
+            why += ", but nothing was trained to probe it"
+        elif kept is None:
+            gain, error = self.probe(Resolution(self.values).applied_to(self.config))
+            kept = gain > max(SMALLEST_GAIN, 2.0 * error)
+            why += f", and it lowers the error of held-out pairs by {100 * gain:.1f} ± {100 * error:.1f} %"
+        kept = self.use(name, lambda: bool(kept))
+        self.row("view direction", kept, "", self.why(name, why), name)
+
+
+def _path_extent(recording: EventRecording) -> float:
+    """Diagonal of the box around the path of the camera while it is used, metres."""
+    times, (start, end) = recording.trajectory.times, recording.span
+    positions = recording.trajectory.positions[(times >= start) & (times <= end)]
+    return float(np.linalg.norm(np.ptp(positions, axis=0))) if len(positions) else 0.0
+
+
+def _angle_of_view(recording: EventRecording, near: float, far: float) -> float:
+    """Angle (rad) under which the path of the camera is seen from the middle of the scene."""
+    return 2.0 * math.atan(0.5 * _path_extent(recording) / math.sqrt(near * far))
 
 
 def _check(flag: str, make: Callable[[], object]) -> None:

@@ -33,8 +33,8 @@ class EnerfModelConfig(ModelConfig):
     """E-NeRF. What is None is chosen from the recording when training starts, and stored in config.yml."""
 
     _target: Type = field(default_factory=lambda: EnerfModel)  # noqa: UP006
-    num_levels: int = 10
-    """Levels of the hash grid."""
+    num_levels: Optional[int] = None  # noqa: UP045
+    """Levels of the hash grid. None: so many that each is at least 1.4 times as fine as the one before, at most 10."""
     base_res: int = 16
     """Cells along the box at the coarsest level of the hash grid."""
     max_res: Optional[int] = None  # noqa: UP045
@@ -47,14 +47,16 @@ class EnerfModelConfig(ModelConfig):
     """Width of the colour network."""
     num_features: int = 15
     """Numbers that the density network tells the colour network."""
-    view_direction: bool = False
-    """Let colour depend on the viewing direction: for shiny scenes that are seen from many sides."""
+    view_direction: Optional[bool] = None  # noqa: UP045
+    """Let brightness depend on the viewing direction, for shiny scenes that are seen from many sides. None: where the
+    camera goes around the scene and a short training shows that it helps."""
     brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
     """What the colour network's output spans evenly: log brightness, or brightness as in the paper."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
-    sampling: Literal["proposal", "uniform"] = "proposal"
-    """Where samples along a ray lie: where a small network expects surfaces, or everywhere."""
+    sampling: Optional[Literal["proposal", "uniform"]] = None  # noqa: UP045
+    """Where samples along a ray lie: where a small network expects surfaces, or everywhere. None: everywhere where they
+    are as many as the pixels by which near and far move against each other."""
     num_proposal_samples: int = 48
     """Samples of the proposal network along a ray."""
     num_samples: int = 24
@@ -73,8 +75,9 @@ class EnerfModelConfig(ModelConfig):
     0, or as the paper for enerf-paper."""
     frame_loss_weight: float = 10.0
     """Weight of the loss on frames."""
-    opacity_loss_weight: float = 1.0
-    """Weight of the share of each ray that no surface stops. 0 for objects in front of nothing."""
+    opacity_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the share of each ray that no surface stops; 0 for an object before nothing. None: 0 where the sensor's
+    border is silent, else 1."""
     distortion_loss_weight: float = 0.01
     """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
     interlevel_loss_weight: float = 1.0
@@ -114,7 +117,8 @@ class EnerfModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        assert config.max_res and config.num_channels and config.near_plane is not None
+        assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
+        assert config.sampling and config.view_direction is not None and config.opacity_loss_weight is not None
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
         self.supervision = EventSupervision(

@@ -22,6 +22,7 @@ from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
+from enerf_ns.probe import view_direction_gain
 
 
 @dataclass
@@ -54,7 +55,10 @@ class EnerfTrainerConfig(TrainerConfig):
             group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
         if not pipeline.resolution.choices:
             recording = parser.setup().recording()
-            pipeline.resolution = resolve(pipeline, recording, self.preset)
+            optimizer, device = config.optimizers["fields"]["optimizer"], config.machine.device_type
+            pipeline.resolution = resolve(
+                pipeline, recording, self.preset, lambda filled: view_direction_gain(filled, optimizer, device)
+            )
         index_events(config.recording())
         return config
 
@@ -139,12 +143,13 @@ def recording_table(config: EnerfTrainerConfig) -> Table:
 
 
 def choices_table(choices: Sequence[Choice]) -> Table:
-    """What is kept and what is left out, and why."""
-    table = Table(title="Parts of the method", title_justify="left")
-    for column in ("part", "", "what", "why"):
+    """What is kept and what is left out, why, and by which flag it is forced."""
+    prefix = "--pipeline."
+    table = Table(title="Parts of the method", caption=f"forced by {prefix}FLAG VALUE, those of event-data at the end")
+    table.title_justify = table.caption_justify = "left"
+    for column in ("part", "", "what", "why", "flag"):
         table.add_column(column)
     for choice in choices:
-        table.add_row(
-            choice.part, "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]", choice.value, choice.why
-        )
+        kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
+        table.add_row(choice.part, kept, choice.value, choice.why, f"[dim]{choice.flag.removeprefix(prefix)}[/dim]")
     return table

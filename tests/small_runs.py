@@ -30,7 +30,7 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
     manager.event_pairs = manager.train_num_rays_per_batch = 64
     manager.silent_pairs, manager.silence_ms = 0, 5.0
     model.opacity_loss_weight, model.distortion_loss_weight = 0.0, 0.01
-    model.log2_table_size, model.num_levels = 12, 4
+    model.log2_table_size, model.num_levels, model.sampling = 12, 4, "proposal"
     model.num_samples = model.num_proposal_samples = 16
     parts = {"data": manager, "model": model, "sensor": model.sensor}
     for name, value in changes.items():
@@ -75,6 +75,7 @@ SMALL: dict[str, Any] = {
     "pipeline.datamanager.silent_pairs": 0,
     "pipeline.model.log2_table_size": 12,
     "pipeline.model.num_levels": 4,
+    "pipeline.model.sampling": "proposal",
     "pipeline.model.num_samples": 16,
     "pipeline.model.num_proposal_samples": 16,
 }

@@ -31,7 +31,10 @@ def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colou
 
 
 def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
-    forced = {"max_res": 99, "near_plane": 0.05, "num_channels": 3}
+    forced = {
+        "max_res": 99, "num_levels": 3, "near_plane": 0.05, "num_channels": 3,
+        "sampling": "uniform", "opacity_loss_weight": 0.3, "view_direction": True,
+    }  # fmt: skip
     config = small_config(recording, tmp_path, **{f"model__{name}": value for name, value in forced.items()})
     config.pipeline.model.sensor.contrast_thresholds = (0.1, 0.3)
     config.pipeline.datamanager.dataparser.depth_range = (1.0, 2.0)
@@ -41,7 +44,16 @@ def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
     assert filled.model.sensor.contrast_thresholds == (0.1, 0.3)
     assert filled.datamanager.dataparser.depth_range == (1.0, 2.0)
     why = {choice.part: choice.why for choice in resolution.choices}
-    assert {why[part] for part in ("contrast thresholds", "colour", "contraction", "hash grid")} == {"set by flag"}
+    parts = (
+        "threshold per polarity",
+        "colour",
+        "box",
+        "hash grid",
+        "proposal network",
+        "opacity loss",
+        "view direction",
+    )
+    assert {why[part] for part in parts} == {"set by flag"}
 
 
 def test_the_registered_method_is_left_as_it_was(recording: Path, tmp_path: Path):
@@ -105,7 +117,7 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
     paper = resolve(PAPER, read_recording(recording)).values
     assert paper["datamanager.event_pairs"] == 30096 and paper["datamanager.silent_pairs"] == 0
     assert paper["model.event_loss"] == "squared" and "datamanager.pair_mode" not in paper
-    assert rows(resolution)["contrast thresholds"].why == "the recording states them"
+    assert rows(resolution)["threshold per polarity"].why == "the recording states them"
 
 
 def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp_path: Path):
@@ -114,7 +126,7 @@ def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp
     on, off = resolution.values["model.sensor.contrast_thresholds"]
     index = index_events(unknown)
     assert on * index.num_positive == pytest.approx(off * (len(index) - index.num_positive))
-    assert f"{index.num_positive:,} on" in rows(resolution)["contrast thresholds"].why
+    assert f"{index.num_positive:,} on" in rows(resolution)["threshold per polarity"].why
 
 
 def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_path: Path):
@@ -133,8 +145,13 @@ def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_pa
     ("setting", "value", "part"),
     [
         ("sensor__response", "logarithm:0.1", "response"),
-        ("sensor__contrast_thresholds", (0.25, 0.25), "contrast thresholds"),
-        ("model__max_res", 64, "hash grid"),
+        ("sensor__contrast_thresholds", (0.25, 0.25), "threshold per polarity"),
+        ("sensor__refractory_period_ns", 1000, "refractory period"),
+        ("model__sampling", "uniform", "proposal network"),
+        ("model__opacity_loss_weight", 0.0, "opacity loss"),
+        ("model__view_direction", True, "view direction"),
+        ("data__silent_pairs", 5, "silent pixels"),
+        ("model__num_levels", 4, "hash grid"),
         ("model__num_channels", 1, "colour"),
     ],
 )

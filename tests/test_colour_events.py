@@ -258,8 +258,9 @@ def test_the_refractory_period_reaches_the_rays_and_the_table(recording: EventRe
     blind = replace(recording, refractory_period=8_000_000)
     config = small_config(blind)
     config.datamanager.pair_mode = mode
-    why = next(choice.why for choice in resolve(config, blind).choices if choice.part == "event loss")
-    assert "8 ms" in why and ("successor" in why) == approximate
+    rows = {choice.part: choice for choice in resolve(config, blind).choices}
+    assert rows["refractory period"].kept and "8 ms" in rows["refractory period"].value
+    assert ("successor" in rows["event loss"].why) == approximate
     pipeline = config.setup(device="cpu")
     sensor, index = pipeline.model.sensor, index_events(blind)
     events: Any = pipeline.datamanager.next_batch(sensor).events

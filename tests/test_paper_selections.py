@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from recordings import write_esim
+from recordings import HEIGHT, WIDTH, write_esim
 
 from enerf_ns.choices import resolve
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.recording import Frames
+from enerf_ns.dataparsers.recording import Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf, enerf_paper
 from enerf_ns.paper_selections import PRESETS, Preset, event_time_range, preset_named
@@ -227,8 +227,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def replace_frames(recording: Any, frames: Frames | None) -> Any:
+    """The recording with other frames, and four events a millisecond of their path, at one pixel after another."""
     trajectory = frames.trajectory if frames else recording.trajectory
-    return replace(recording, frames=frames, blurred_frames=None, trajectory=trajectory)
+    times = np.arange(trajectory.start, trajectory.end, 250_000)
+    x, y = np.divmod(np.arange(len(times)) % (WIDTH * HEIGHT), HEIGHT)
+    events = Events(x, y, times, np.ones(len(times), np.int8))
+    return replace(
+        recording, frames=frames, blurred_frames=None, trajectory=trajectory, stream_events=lambda: iter([events])
+    )
 
 
 def pipeline_config(method: Any = PAPER, **changes: Any) -> Any:

@@ -32,8 +32,12 @@ class EventBatch:
     @staticmethod
     def joined(batches: list[EventBatch]) -> EventBatch:
         """One batch of several, in their order."""
-        names = ("pixels", "start", "end", "on", "off", "silent")
-        return EventBatch(*(torch.cat([getattr(batch, name) for batch in batches]) for name in names))
+        columns = zip(*(vars(batch).values() for batch in batches), strict=True)
+        return EventBatch(*(torch.cat(column) for column in columns))
+
+    def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
+        """The pairs that are chosen."""
+        return EventBatch(*(column[chosen] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,10 @@ class FrameBatch:
     """Frame, row and column of each pixel."""
     colours: Float[Tensor, "rays 3"]
     """Colours that were recorded at the pixels, in [0, 1]."""
+
+    def subset(self, chosen: Bool[Tensor, " rays"]) -> FrameBatch:
+        """The pixels that are chosen."""
+        return FrameBatch(self.indices[chosen], self.colours[chosen])
 
 
 @dataclass(frozen=True)
