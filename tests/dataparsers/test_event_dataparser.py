@@ -95,7 +95,7 @@ def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
     outputs, recording = parse(folder), read_recording(folder)
     time = int(outputs.metadata["frames"].times[0])
     frame = outputs.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
-    transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+    transform, scale = outputs.metadata["transform"], outputs.dataparser_scale
     event = PosedCamera(recording.camera, recording.trajectory, transform, scale).rays(
         torch.arange(24 * 18), torch.full((24 * 18,), time)
     )
