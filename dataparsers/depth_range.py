@@ -83,6 +83,7 @@ def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory)
     if len(events):
         directions = camera.pixel_directions()
         path_times = evenly_spaced(events.t[0], events.t[-1], 2000)
+        path_times = path_times[trajectory.in_gaps(events.t).any() | ~trajectory.in_gaps(path_times)]
         path = trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
         extent = float(np.linalg.norm(np.ptp(path, axis=0)))
         generator = np.random.default_rng(0)

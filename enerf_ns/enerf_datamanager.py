@@ -227,9 +227,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @property
     def _stretches(self) -> Tensor | None:
-        """Where the gaps of the poses leave the events in several parts, the first and last instant (ns) of each."""
-        stretches = self.recording.stretches
-        return torch.from_numpy(stretches).to(self.device) if len(stretches) > 1 else None
+        """First and last instant (ns) of each part of the recording that is used; None where that is its span."""
+        stretches, span = self.recording.stretches, self.recording.span
+        return None if stretches.tolist() == [[*span]] else torch.from_numpy(stretches).to(self.device)
 
     @property
     def _frames(self) -> Frames:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from recordings import seconds
+from recordings import changed, seconds, write_event_recording
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
-from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.inspection import Inspection
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 
 HOUR = 3600 * 10**9
@@ -29,36 +26,6 @@ LATEST = 2**62 - 10**9
 DEPTH_RANGE = 0.7, 1.9
 
 ORIGINS = [0.0, 1e4, 1e5, 1e6, 5e6]
-
-
-def changed(
-    recording: EventRecording, zero: int = 0, origin: float = 0.0, slower: int = 1, faster: int = 1
-) -> EventRecording:
-    """The recording on a clock that shows `zero` (ns) at its begin, in a world that begins elsewhere, and slower."""
-
-    def moved(times: np.ndarray) -> np.ndarray:
-        return (times - recording.trajectory.start) * slower // faster + zero
-
-    old = recording.trajectory
-    positions = old.positions + origin * np.array([0.6, -0.8, 0.1])
-    trajectory = Trajectory(moved(old.times), positions, old.quaternions)
-
-    def frames(old: Frames | None) -> Frames | None:
-        return old and replace(old, times=moved(old.times), trajectory=trajectory)
-
-    return replace(
-        recording,
-        trajectory=trajectory,
-        stream_events=lambda: (Events(e.x, e.y, moved(e.t), e.p) for e in recording.stream_events()),
-        frames=frames(recording.frames),
-        blurred_frames=frames(recording.blurred_frames),
-    )
-
-
-def write_event_recording(recording: EventRecording, folder: Path) -> Path:
-    folder.mkdir()
-    event_recording.write(recording, folder)
-    return folder
 
 
 def write_davis(recording: EventRecording, folder: Path) -> Path:
@@ -100,7 +67,7 @@ def on_clocks(request: pytest.FixtureRequest, recording: Path, tmp_path_factory)
 
 
 def test_the_clock_changes_nothing_but_stamps(on_clocks, tmp_path: Path) -> None:
-    """Numbers, problems, cameras, pairs, rays and trained weights of three clocks are those of a clock from 0, to the bit."""
+    """Numbers, problems, cameras, pairs, rays and trained weights are on three clocks what they are on one from 0."""
     seen = {}
     layout, folders = on_clocks
     for zero, folder in folders.items():
