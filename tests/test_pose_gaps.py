@@ -1,4 +1,4 @@
-"""A simulated recording of 3 s out of which a second of poses is cut: what lies there is left out, counted and shown."""
+"""A simulated recording of 3 s without the poses of a second: what lies there is left out, counted and shown."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def test_a_range_that_ends_within_a_gap_is_used_up_to_it(folder: Path, gap, tmp_
 def test_frames_of_a_gap_alone_are_an_error_of_one_sentence(folder: Path, gap):
     recording = read_recording(folder)
     lost = recording.frames.subset(np.flatnonzero(inside(torch.from_numpy(recording.frames.times), gap).numpy()))
-    with pytest.raises(RecordingError, match="All frames of .* lie in gaps of the poses") as error:
+    with pytest.raises(RecordingError, match=r"All frames of .* lie in gaps of the poses") as error:
         split_frames(replace(recording, frames=lost, blurred_frames=None), EventDataParserConfig(), False)
     assert "\n" not in str(error.value)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_stretches_are_what_the_gaps_leave_of_the_span(time_range: tuple[float, 
     used = [m for m in range(start, end + 1) if any(first <= m <= last for first, last in PIECES)]
     milliseconds = chosen.stretches // 1_000_000
     assert [m for first, last in milliseconds.tolist() for m in range(first, last + 1)] == used
-    gaps = [(a, b) for (_, a), (b, _) in zip(PIECES[:-1], PIECES[1:], strict=True) if a < end and b > start]
+    gaps = [(a, b) for (_, a), (b, _) in pairwise(PIECES) if a < end and b > start]
     assert (chosen.pose_gaps // 1_000_000).tolist() == [[*gap] for gap in gaps]
 
     instants = chosen.instants(500)
