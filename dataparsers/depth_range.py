@@ -13,7 +13,7 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 GRID_WIDTH = 240  # of the view that votes are cast into, coarse enough for the number of events
 TILE = 16
@@ -47,6 +47,8 @@ def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | N
 def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
     """Depth range measured from a recording's events; takes seconds, and is done once for a recording in a process."""
     events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
+    posed = ~recording.in_left_out_gaps(events.t)
+    events = Events(events.x[posed], events.y[posed], events.t[posed], events.p[posed])
     try:
         return estimate_depth_range(events, recording.camera, recording.trajectory)
     except ValueError as error:
@@ -80,7 +82,8 @@ def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory)
     extent = 0.0
     if len(events):
         directions = camera.pixel_directions()
-        path_times = np.linspace(events.t[0], events.t[-1], 2000).astype(np.int64)
+        path_times = evenly_spaced(events.t[0], events.t[-1], 2000)
+        path_times = path_times[trajectory.in_gaps(events.t).any() | ~trajectory.in_gaps(path_times)]
         path = trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
         extent = float(np.linalg.norm(np.ptp(path, axis=0)))
         generator = np.random.default_rng(0)

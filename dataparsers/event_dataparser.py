@@ -20,7 +20,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import exit_with_a_sentence
+from enerf_ns.dataparsers.errors import RecordingError, exit_with_a_sentence
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.recording import EventRecording, Frames
@@ -56,6 +56,8 @@ class EventDataParserConfig(DataParserConfig):
     """First and last second that is used, on the recording's clock. None: all."""
     keep_hot_pixels: bool = False
     """Use pixels that fire far more often than their neighbourhood."""
+    keep_pose_gaps: bool = False
+    """Use what lies in gaps between poses, which are guesses there."""
     train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
     """Numbers of the frames to train on, from 0. None: all that are not held out."""
     held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
@@ -76,7 +78,8 @@ class EventDataParser(DataParser):
         """The recording of this parser's folder, read once per process."""
         config = self.config
         time_range = config.time_range and (config.time_range[0], config.time_range[1])  # a list, from some YAML
-        return read_recording(config.data, config.format, time_range, config.keep_hot_pixels, **vars(config.options))
+        selection = time_range, config.keep_hot_pixels, config.keep_pose_gaps
+        return read_recording(config.data, config.format, *selection, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         with exit_with_a_sentence():
@@ -85,12 +88,16 @@ class EventDataParser(DataParser):
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
         """Cameras of one split, and the box, as Nerfstudio wants them.
 
+        The metadata hold the recording; the frames, and whether they are some, as of `split_frames`; and transform,
+        the float64 original of `dataparser_transform`, since float32 is 0.25 m coarse 5e6 m from the world's origin.
+
         Args:
             recording: What was read.
             split: "train", or "val" and "test", which are the held-out frames.
 
         Raises:
-            RecordingError: if the depth of the scene is neither known nor observable.
+            RecordingError: The depth of the scene is neither known nor observable, or all frames lie in gaps of the
+                poses.
         """
         near, far = scene_depth_range(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
@@ -117,7 +124,12 @@ class EventDataParser(DataParser):
             image_filenames=list(frames.filenames),
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.from_numpy(box).float()),
-            metadata={"recording": recording, "frames": frames, "are_frames": are_frames},
+            metadata={
+                "recording": recording,
+                "frames": frames,
+                "are_frames": are_frames,
+                "transform": torch.from_numpy(transform),
+            },
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
@@ -127,13 +139,24 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
     """The frames of one split; where the recording has none, instants along its trajectory to picture events at.
 
     Returns:
-        The frames, and whether they are some: otherwise, their file names stand for no files.
+        The frames, without those in gaps of the poses, and whether they are some: otherwise, their file names stand for
+        no files.
+
+    Raises:
+        RecordingError: All frames lie in gaps of the poses.
     """
     if held_out and recording.held_out_frames:
         return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     if not held_out and config.train_frames == "blurred" and recording.blurred_frames:
         frames = recording.blurred_frames
+    posed = ~recording.in_left_out_gaps(frames.times)
+    if not posed.any():
+        raise RecordingError(
+            f"All frames of {recording.path} lie in gaps of the poses; add the poses that are missing, or use the "
+            "frames with --keep-pose-gaps True."
+        )
+    frames = frames.subset(np.flatnonzero(posed))
     start, end = recording.span
     used = (frames.times >= start) & (frames.times <= end)
     if not used.any():
@@ -156,7 +179,7 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
 
 def event_pictures(recording: EventRecording) -> Frames:
     """Instants along the trajectory, for a recording without frames; their file names stand for no file."""
-    times = np.linspace(*recording.span, NUM_EVENT_PICTURES + 2)[1:-1].astype(np.int64)
+    times = recording.instants(NUM_EVENT_PICTURES + 2)[1:-1]
     names = tuple(recording.path / f"events_{i:05d}.png" for i in range(len(times)))
     return Frames(filenames=names, times=times, camera=recording.camera, trajectory=recording.trajectory)
 

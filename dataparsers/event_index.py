@@ -37,6 +37,9 @@ class EventIndex:
     """What was left out of the recording's events, or could not be stored, one sentence each."""
     share_outside_poses: float = 0.0
     """Share of the recording's events that are left out because there are no poses."""
+    num_in_gaps: int = 0
+    """Number of the events within gaps of the poses. They count, but no pair starts or ends with them unless gaps are
+    kept."""
 
     def __len__(self) -> int:
         return len(self.times)

@@ -7,13 +7,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+from jaxtyping import Int64
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, survey_events
 from enerf_ns.dataparsers.index_cache import build_index, entry_name, load_index
-from enerf_ns.dataparsers.recording import LARGEST_SPAN_RATIO, EventRecording, Events, left_out, seconds
+from enerf_ns.dataparsers.recording import (
+    EVENTS_AT_A_TIME,
+    LARGEST_SPAN_RATIO,
+    EventRecording,
+    Events,
+    left_out,
+    seconds,
+)
 
 LARGEST_RATE = 2e9
 """Events per second that no sensor can send; more of them means that times are in another unit than was thought."""
@@ -79,7 +88,39 @@ def index_events(recording: EventRecording) -> EventIndex:
             f"{len(survey.hot_pixels):,} hot pixels, which fire over 10 times as often as their neighbourhood, are "
             f"left out with {survey.num_hot_events:,} events; --keep-hot-pixels True keeps them."
         )
-    return replace(index, notes=tuple(notes), share_outside_poses=outside / survey.num_events)
+    in_gaps = _count_in_gaps(recording, index)
+    if not recording.keep_pose_gaps:
+        notes.extend(_gap_notes(recording, in_gaps, len(index)))
+    share = outside / survey.num_events
+    return replace(index, notes=tuple(notes), share_outside_poses=share, num_in_gaps=in_gaps)
+
+
+def _count_in_gaps(recording: EventRecording, index: EventIndex) -> int:
+    if not len(recording.pose_gaps):
+        return 0
+    pieces = (index.times[first : first + EVENTS_AT_A_TIME] for first in range(0, len(index), EVENTS_AT_A_TIME))
+    return sum(int(recording.trajectory.in_gaps(times.numpy()).sum()) for times in pieces)
+
+
+def _gap_notes(recording: EventRecording, num_events: int, total: int) -> Iterator[str]:
+    if num_events:
+        yield (
+            f"{num_events:,} of {total:,} events ({100 * num_events / total:.2g} %) lie in "
+            f"{describe_gaps(recording.pose_gaps)}, and start or end no pair; --keep-pose-gaps True keeps them."
+        )
+    for what, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
+        if frames is not None and (num_frames := int(recording.trajectory.in_gaps(frames.times).sum())):
+            yield (
+                f"{num_frames:,} of {len(frames.times):,} {what} lie in gaps of the poses and are left out; "
+                "--keep-pose-gaps True keeps them."
+            )
+
+
+def describe_gaps(gaps: Int64[np.ndarray, "gaps 2"]) -> str:
+    """What gaps of the poses (ns) there are, at least one."""
+    begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
+    lasts = f"{(end - begin) * 1e-9:.2f} s from {begin * 1e-9:.2f} s on"
+    return f"a gap of the poses of {lasts}" if len(gaps) == 1 else f"{len(gaps)} gaps of the poses, the longest {lasts}"
 
 
 def _check(recording: EventRecording, survey: Survey) -> None:

@@ -34,6 +34,7 @@ from enerf_ns.dataparsers.problems import (
 )
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.scene_box import scene_normalisation
+from enerf_ns.dataparsers.trajectory import evenly_spaced
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -288,10 +289,9 @@ class Inspection:
     def _path(self, number: int) -> tuple[Int64[np.ndarray, " number"], Float64[np.ndarray, "number 3 4"]]:
         """Times and poses while there are events; not a number within gaps between poses."""
         first, last = self.statistics.edges[[0, -1]]
-        times = np.linspace(first, last, number).astype(np.int64)
+        times = evenly_spaced(first, last, number)
         poses = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()
-        for begin, end in pose_gaps(self.recording, self.statistics):
-            poses[(times > begin) & (times < end)] = np.nan
+        poses[self.recording.trajectory.in_gaps(times)] = np.nan
         return times, poses
 
     @property
@@ -303,7 +303,7 @@ class Inspection:
         frames = self._frames
         during = np.flatnonzero((frames.times >= first) & (frames.times <= last)) if frames is not None else []
         if frames is None or not len(during):
-            times = np.linspace(first, last, NUM_INSTANTS + 2)[1:-1].astype(np.int64)
+            times = evenly_spaced(first, last, NUM_INSTANTS + 2)[1:-1]
             return [Instant(_seconds(time), self._events_at(time)) for time in times]
         chosen = during[np.unique(np.linspace(0, len(during) - 1, NUM_INSTANTS + 2)[1:-1].round().astype(int))]
         return [

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import read_json
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording import EventRecording, Frames, nanoseconds
+from enerf_ns.dataparsers.trajectory import evenly_spaced
 
 MAX_BINS = 1000
 """Most bins of the event rate: more are not told apart on a screen."""
@@ -32,12 +33,6 @@ EVENTS_AT_ONCE = 2**24
 
 MAX_SHARE_OUTSIDE = 0.05
 """Largest share of events or frames without poses; a camera that starts a moment before the tracker loses less."""
-
-GAP_RATIO = 10
-"""Factor by which a gap between poses is longer than the median interval; the spline guesses within it."""
-
-MIN_GAP = 0.1
-"""Shortest gap between poses, seconds. A hand turns the camera by many degrees within a gap of this length."""
 
 MAX_TURN = 5.0
 """Most degrees that the camera may turn between two poses. A hand's angular acceleration of 1000 degrees/s² at 20 poses
@@ -161,11 +156,11 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
     step = 1 if at_most is None else -(-len(index) // at_most)
     num_bins = int(np.clip(len(index) // step // EVENTS_PER_BIN, 1, MAX_BINS))
     start, end = index.span
-    counted = np.zeros(num_bins, np.int64)
+    edges, counted = evenly_spaced(start, end, num_bins + 1), np.zeros(num_bins, np.int64)
+    inner = torch.from_numpy(edges[1:-1])
     for first in range(0, len(index), step * EVENTS_AT_ONCE):
-        times = index.times[first : first + step * EVENTS_AT_ONCE : step]
-        counted += np.bincount(((times - start) * num_bins // (end - start + 1)).numpy(), minlength=num_bins)
-    edges = np.linspace(start, end, num_bins + 1).astype(np.int64)
+        times = index.times[first : first + step * EVENTS_AT_ONCE : step].contiguous()
+        counted += torch.bucketize(times, inner, right=True).bincount(minlength=num_bins).numpy()
     return EventStatistics(
         edges=edges,
         rate=counted * step / np.maximum(np.diff(edges) * 1e-9, 1e-9),
@@ -203,11 +198,9 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
 
 
 def pose_gaps(recording: EventRecording, statistics: EventStatistics) -> Int64[np.ndarray, "gaps 2"]:
-    """Begin and end (ns) of each time that the poses leave out within the span of the events."""
-    times = recording.trajectory.times[_poses_used(recording, statistics)]
-    intervals = np.diff(times)
-    gaps = np.flatnonzero(intervals > max(GAP_RATIO * np.median(intervals), MIN_GAP * 1e9))
-    return np.stack([times[gaps], times[gaps + 1]], axis=1)
+    """Begin and end (ns) of each gap of the poses that reaches into the span of the events."""
+    (first, *_, last), gaps = statistics.edges, recording.pose_gaps
+    return gaps[(gaps[:, 0] < last) & (gaps[:, 1] > first)]
 
 
 def pose_jumps(
@@ -243,14 +236,15 @@ def unusual_rates(
     poses = recording.trajectory.poses(torch.from_numpy(edges)).numpy()
     distance = _viewing_distance(recording, statistics, depth_range)
     turns, moves = _steps(Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3])
-    shift = recording.camera.fx * (turns + moves / distance)
+    known = ~recording.trajectory.in_gaps(edges)
+    shift = np.where(known[:-1] & known[1:], recording.camera.fx * (turns + moves / distance), 0.0)
     speed = shift / np.maximum(np.diff(edges), 1)
     moving = speed > MOVING * np.percentile(speed, 90)
     usual_rate, usual_speed = (np.median(column[moving]) if moving.any() else 0.0 for column in (rate, speed))
     silences = _spans(moving & (rate < DROPOUT_RATIO * usual_rate), edges)
-    shifted = np.diff(np.interp(silences, edges, np.append(0.0, np.cumsum(shift))), axis=1)[:, 0]
+    shifted = np.append(0.0, np.cumsum(shift))[np.searchsorted(edges, silences)]
     burst = (rate > BURST_RATIO * usual_rate) & (rate * usual_speed > BURST_RATIO * usual_rate * speed)
-    return silences[shifted > MIN_SILENT_MOTION], _spans(burst & (usual_rate > 0), edges)
+    return silences[shifted[:, 1] - shifted[:, 0] > MIN_SILENT_MOTION], _spans(burst & (usual_rate > 0), edges)
 
 
 def _unfinished(folder: Path) -> Iterator[Problem]:
@@ -287,8 +281,9 @@ def _pose_problems(
         yield Problem(
             f"There are no poses for {(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on"
             + (f", and in {_count(len(gaps) - 1, 'other gap')}" if len(gaps) > 1 else "")
-            + f", while they usually come every {usual_interval}.",
-            f"Use a part that the tracker saw: {flag}.",
+            + f", while they usually come every {usual_interval}; what lies there is "
+            + ("used with guessed poses." if recording.keep_pose_gaps else "left out."),
+            f"Add the poses that are missing, or use a part that the tracker saw: {flag}.",
         )
     inside = ~np.isin(times[:-1], gaps[:, 0])
     if inside.any() and (turn := math.degrees(np.percentile(turns[inside], 99))) > MAX_TURN:
@@ -445,12 +440,16 @@ def _spans(chosen: np.ndarray, edges: np.ndarray) -> Int64[np.ndarray, "spans 2"
 
 
 def _time_range_without(spans: np.ndarray, statistics: EventStatistics) -> str:
-    """The flag that selects the longest part of the events which none of the spans (ns) touches."""
+    """The flag that selects the longest part of the events which none of the spans (ns) touches, in milliseconds."""
     spans = spans[np.argsort(spans[:, 0])]
     begins = np.maximum.accumulate(np.concatenate([statistics.edges[:1], spans[:, 1]]))
     ends = np.concatenate([spans[:, 0], statistics.edges[-1:]])
     longest = np.argmax(ends - begins)
-    return f"--time-range {math.ceil(begins[longest] * 1e-6) / 1e3} {math.floor(ends[longest] * 1e-6) / 1e3}"
+    begin, end = int(begins[longest]), int(ends[longest])
+    first, last = -(-begin // 10**6), end // 10**6
+    first += nanoseconds(first / 1e3) < begin
+    last -= nanoseconds(last / 1e3) > end
+    return f"--time-range {first / 1e3} {last / 1e3}"
 
 
 def _count(number: int, what: str) -> str:

@@ -11,11 +11,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int, Int64
+from jaxtyping import Bool, Int, Int64
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
 """Events that readers hand on at once: enough for speed, few enough to need hardly any memory."""
@@ -131,6 +131,8 @@ class EventRecording:
     """First and last time (ns) of what is used of the recording."""
     keep_hot_pixels: bool = False
     """Whether pixels that fire far more often than their neighbourhood are used."""
+    keep_pose_gaps: bool = False
+    """Whether instants within the gaps of the trajectory are used."""
     event_file_states: tuple[tuple[str, int, int], ...] = ()
     """Path, size in bytes and time of modification (ns) of each of `event_files` when they were looked at; taken here
     unless given."""
@@ -147,25 +149,35 @@ class EventRecording:
         }
         self._set(**covered, notes=tuple(notes), shares_outside_poses=shares)
 
-    def selected(self, time_range: tuple[float, float] | None, keep_hot_pixels: bool) -> EventRecording:
+    def selected(
+        self, time_range: tuple[float, float] | None, keep_hot_pixels: bool, keep_pose_gaps: bool = False
+    ) -> EventRecording:
         """The recording of which a part of the events is used; for one selection always the same object.
 
         Args:
             time_range: First and last time in seconds on the recording's clock, or None for all.
             keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
+            keep_pose_gaps: Use instants within the gaps of the trajectory.
 
         Raises:
-            FlagError: The range holds no poses.
+            FlagError: The range holds no poses, or lies within a gap that is left out.
         """
-        nanoseconds = time_range and (round(time_range[0] * 1e9), round(time_range[1] * 1e9))
+        range_ns = time_range and (nanoseconds(time_range[0]), nanoseconds(time_range[1]))
         selection = self
-        if (nanoseconds, keep_hot_pixels) != (self.time_range, self.keep_hot_pixels):
-            selection = _with_selection(self, nanoseconds, keep_hot_pixels)
+        chosen = range_ns, keep_hot_pixels, keep_pose_gaps
+        if chosen != (self.time_range, self.keep_hot_pixels, self.keep_pose_gaps):
+            selection = _with_selection(self, *chosen)
         start, end = selection.span
         if time_range is not None and not start < end:
             raise FlagError(
                 f"--time-range {time_range[0]:g} {time_range[1]:g} (seconds) holds none of the poses of "
                 f"{self.path}, which lie from {seconds(self.trajectory.start)} to {seconds(self.trajectory.end)}."
+            )
+        if not len(selection.stretches):
+            ((begin, after),) = selection.pose_gaps
+            raise FlagError(
+                f"The time range lies within a gap of the poses of {self.path}, from {seconds(begin)} to "
+                f"{seconds(after)}; give another --time-range, or use it with --keep-pose-gaps True."
             )
         return selection
 
@@ -174,6 +186,31 @@ class EventRecording:
         """First and last time (ns) that is used: of the poses, within the range that was selected."""
         start, end = self.time_range or (self.trajectory.start, self.trajectory.end)
         return max(start, self.trajectory.start), min(end, self.trajectory.end)
+
+    @property
+    def pose_gaps(self) -> Int64[np.ndarray, "gaps 2"]:
+        """Those of `Trajectory.gaps` that reach into the span, whether they are kept or not."""
+        (start, end), gaps = self.span, self.trajectory.gaps
+        return gaps[(gaps[:, 0] < end) & (gaps[:, 1] > start)]
+
+    @property
+    def stretches(self) -> Int64[np.ndarray, "stretches 2"]:
+        """First and last instant (ns) of each part of the span that is used: all, or what lies between the gaps."""
+        start, end = self.span
+        gaps = self.pose_gaps[: 0 if self.keep_pose_gaps else None]
+        stretches = np.concatenate([[start], gaps.flatten(), [end]]).reshape(-1, 2)
+        return stretches[stretches[:, 0] <= stretches[:, 1]]
+
+    def instants(self, number: int) -> Int64[np.ndarray, " number"]:
+        """Instants (ns) spread evenly over the `stretches`, at least 2, from their first to their last."""
+        begins, ends = self.stretches.T
+        after = np.cumsum(ends - begins + 1)
+        places = evenly_spaced(0, after[-1] - 1, number)
+        return places + (ends + 1 - after)[np.searchsorted(after, places, "right")]
+
+    def in_left_out_gaps(self, times: Int64[np.ndarray, " times"]) -> Bool[np.ndarray, " times"]:
+        """Which times (ns) lie in gaps of the poses and are therefore not used; none where gaps are kept."""
+        return self.trajectory.in_gaps(times) & (not self.keep_pose_gaps)
 
     @property
     def has_frames(self) -> bool:
@@ -254,13 +291,20 @@ def _is_response(name: object) -> bool:
 
 
 @cache
-def _with_selection(recording: EventRecording, time_range: tuple[int, int] | None, keep: bool) -> EventRecording:
-    return replace(recording, time_range=time_range, keep_hot_pixels=keep)
+def _with_selection(
+    recording: EventRecording, time_range: tuple[int, int] | None, keep_hot_pixels: bool, keep_pose_gaps: bool
+) -> EventRecording:
+    return replace(recording, time_range=time_range, keep_hot_pixels=keep_hot_pixels, keep_pose_gaps=keep_pose_gaps)
 
 
 def left_out(dropped: int, total: int, what: str) -> str:
     """A note about frames or events that lie outside the poses."""
     return f"{dropped:,} of {total:,} {what} ({100 * dropped / total:.2g} %) lie outside the poses and are left out."
+
+
+def nanoseconds(time: float) -> int:
+    """A time in seconds, as a user gives it, in nanoseconds."""
+    return round(time * 1e9)
 
 
 def seconds(time: int) -> str:

@@ -12,7 +12,7 @@ from enerf_ns.dataparsers.recording import EventRecording
 def scene_normalisation(
     recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Where the scene lies, seen from every pose of the event camera between the nearest and the farthest depth.
+    """Where the scene lies, seen from all poses of the event camera that are used, between nearest and farthest depth.
 
     Args:
         recording: Trajectory and camera.
@@ -28,8 +28,7 @@ def scene_normalisation(
     if cube is not None:
         return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])
     trajectory, camera = recording.trajectory, recording.camera
-    times = np.linspace(*recording.span, 100).astype(np.int64)
-    poses = trajectory.poses(torch.from_numpy(times)).numpy()
+    poses = trajectory.poses(torch.from_numpy(recording.instants(100))).numpy()
     up = -poses[:, :, 1].mean(axis=0)
     rotation = np.eye(3)
     if np.linalg.norm(up) > 0.1:

@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+GAP_RATIO = 10
+"""Factor by which a gap between poses is longer than the median interval; the spline guesses within it."""
+
+MIN_GAP = 100_000_000
+"""Shortest gap between poses, ns. A hand turns the camera by many degrees within a gap of this length."""
+
+
+def evenly_spaced(start: int, end: int, number: int) -> Int64[np.ndarray, " number"]:
+    """Instants from `start` to `end` (ns), both included, each rounded down; exact, which `np.linspace` is not.
+
+    Args:
+        start, end: ns from any zero; start + i * (end - start) / (number - 1) is computed in integers.
+        number: At least 2.
+    """
+    whole, rest = divmod(int(end) - int(start), number - 1)
+    steps = np.arange(number, dtype=np.int64)
+    return int(start) + whole * steps + rest * steps // (number - 1)
 
 
 class Trajectory:
@@ -73,6 +93,21 @@ class Trajectory:
     def covers(self, times: Int64[Tensor | np.ndarray, "*batch"]) -> Bool[Tensor | np.ndarray, "*batch"]:
         """Which times (ns) lie between the first and the last pose, both included."""
         return (times >= self.start) & (times <= self.end)
+
+    @property
+    def longest_step(self) -> int:
+        """Longest time (ns) between two poses that their own rate explains."""
+        return max(int(GAP_RATIO * np.median(np.diff(self.times))), MIN_GAP)
+
+    @cached_property
+    def gaps(self) -> Int64[np.ndarray, "gaps 2"]:
+        """Times (ns) of each two poses that are further apart than `longest_step`; between them, poses are guesses."""
+        before = np.flatnonzero(np.diff(self.times) > self.longest_step)
+        return np.stack([self.times[before], self.times[before + 1]], axis=1)
+
+    def in_gaps(self, times: Int64[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
+        """Which times (ns) lie within one of the `gaps`; the poses at its ends are known."""
+        return np.searchsorted(self.gaps[:, 0], times) > np.searchsorted(self.gaps[:, 1], times, "right")
 
     def poses(
         self, times: Int64[Tensor, "*batch"], delays: Float64[Tensor, "*batch"] | None = None

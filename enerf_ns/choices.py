@@ -19,7 +19,7 @@ from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig
 from enerf_ns.dataparsers.files import load_image
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
@@ -156,7 +156,7 @@ class _Resolver:
             self.preset_values, self.selection = selections(name, recording, self.parser, paper_batch)
             self._note_flags()
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
-        self.recording = recording.selected(time_range, self.parser.keep_hot_pixels)
+        self.recording = recording.selected(time_range, self.parser.keep_hot_pixels, self.parser.keep_pose_gaps)
 
     @property
     def use_events(self) -> bool:
@@ -201,6 +201,7 @@ class _Resolver:
 
     def resolution(self) -> Resolution:
         self._split()
+        self._poses()
         self._events()
         self._silent_pixels()
         self._sensor()
@@ -240,6 +241,19 @@ class _Resolver:
                 f"{recording.path}: --held-out-every {every} splits none of {num_frames} frames off; it "
                 "must be at least 1, and where the field learns from frames at least 2 and less than twice their number"
             )
+
+    def _poses(self) -> None:
+        """Whether what lies between poses that are far apart is used."""
+        recording, kept = self.recording, self.parser.keep_pose_gaps
+        gaps = recording.pose_gaps
+        if not len(gaps):
+            self.row("pose gaps", False, "", f"none is longer than {recording.trajectory.longest_step * 1e-9:.3g} s")
+            return
+        index = index_events(recording)
+        why = (
+            f"{index.num_in_gaps:,} events ({100 * index.num_in_gaps / len(index):.2g} %) lie in {describe_gaps(gaps)}"
+        )
+        self.row("pose gaps", kept, "used" if kept else "left out", "set by flag; " * kept + why)
 
     def _events(self) -> None:
         """Which pairs are drawn."""

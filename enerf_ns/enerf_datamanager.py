@@ -121,6 +121,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 max_distance=config.max_pair_distance,
                 window_ns=round(config.window_ms * 1e6),
                 uniform_over=config.uniform_over,
+                stretches=self._stretches,
             )
         except ValueError as error:
             raise FlagError(f"{self.recording.path}: {error}") from error
@@ -137,7 +138,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         assert self.config.silence_ms is not None
         silence = round(self.config.silence_ms * 1e6)
         try:
-            return SilentPixelSampler(self.index, *index_events(self.recording).span, silence, silence)
+            span = index_events(self.recording).span
+            return SilentPixelSampler(self.index, *span, silence, silence, self._stretches)
         except ValueError as error:
             raise FlagError(f"{self.recording.path}: {error}") from error
 
@@ -224,13 +226,18 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return 2 * pairs + ((config.train_num_rays_per_batch or 0) if "frames" in config.supervision else 0)
 
     @property
+    def _stretches(self) -> Tensor | None:
+        """First and last instant (ns) of each part of the recording that is used; None where that is its span."""
+        stretches, span = self.recording.stretches, self.recording.span
+        return None if stretches.tolist() == [[*span]] else torch.from_numpy(stretches).to(self.device)
+
+    @property
     def _frames(self) -> Frames:
         return self.train_dataset.frames
 
     def _posed(self, camera, trajectory) -> PosedCamera:
         outputs = self.train_dataparser_outputs
-        transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
-        return PosedCamera(camera, trajectory, transform, scale, self.device)
+        return PosedCamera(camera, trajectory, outputs.metadata["transform"], outputs.dataparser_scale, self.device)
 
     def _frame_pixels(self, number: int) -> Tensor:
         """Frame, row and column of pixels drawn evenly, shape (number, 3)."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.trajectory import Trajectory
 
 WIDTH, HEIGHT = 24, 18
 
@@ -103,4 +106,34 @@ def write_esim(
         (folder / "depth").mkdir()
         for i in range(len(FRAME_TIMES)):
             np.save(folder / f"depth/{i:05d}.npy", np.full((HEIGHT, WIDTH), 1.0 + i, np.float32))
+    return folder
+
+
+def changed(
+    recording: EventRecording, zero: int = 0, origin: float = 0.0, slower: int = 1, faster: int = 1
+) -> EventRecording:
+    """The recording on a clock that shows `zero` (ns) at its begin, in a world that begins elsewhere, and slower."""
+
+    def moved(times: np.ndarray) -> np.ndarray:
+        return (times - recording.trajectory.start) * slower // faster + zero
+
+    old = recording.trajectory
+    positions = old.positions + origin * np.array([0.6, -0.8, 0.1])
+    trajectory = Trajectory(moved(old.times), positions, old.quaternions)
+
+    def frames(old: Frames | None) -> Frames | None:
+        return old and replace(old, times=moved(old.times), trajectory=trajectory)
+
+    return replace(
+        recording,
+        trajectory=trajectory,
+        stream_events=lambda: (Events(e.x, e.y, moved(e.t), e.p) for e in recording.stream_events()),
+        frames=frames(recording.frames),
+        blurred_frames=frames(recording.blurred_frames),
+    )
+
+
+def write_event_recording(recording: EventRecording, folder: Path) -> Path:
+    folder.mkdir()
+    event_recording.write(recording, folder)
     return folder

@@ -59,6 +59,7 @@ def read_recording(
     format: str = "auto",
     time_range: tuple[float, float] | None = None,
     keep_hot_pixels: bool = False,
+    keep_pose_gaps: bool = False,
     **options: object,
 ) -> EventRecording:
     """Reads a recording; its events are read when first asked for. A folder is read once per process.
@@ -67,14 +68,15 @@ def read_recording(
         path: Folder of the recording; never written to.
         format: Name of a registered format, or "auto" to find out.
         time_range: As of `EventRecording.selected`.
-        keep_hot_pixels: As of `EventRecording.selected`.
+        keep_hot_pixels, keep_pose_gaps: As of `EventRecording.selected`.
         options: Of the format, by name; those left out have its defaults.
 
     Raises:
         RecordingError: The folder is of no known format, or anything in it cannot be used.
-        FlagError: There is no such format, it lacks an option, or the range of time holds no poses.
+        FlagError: There is no such format, it lacks an option, or the range of time cannot be used.
     """
-    return _read_folder(Path(path).resolve(), format, **options).selected(time_range, keep_hot_pixels)
+    found = _read_folder(Path(path).resolve(), format, **options)
+    return found.selected(time_range, keep_hot_pixels, keep_pose_gaps)
 
 
 def layouts() -> tuple[str, ...]:

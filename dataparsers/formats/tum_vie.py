@@ -106,9 +106,6 @@ CALIBRATIONS = ("camera-calibration", "mocap-imu-calibration")
 SHORTEST_STEP = 100_000
 """Least nanoseconds between frames or poses (median)."""
 
-LONGEST_GAP = 200_000_000
-"""Most nanoseconds between poses that interpolation may bridge."""
-
 BALANCE_TOLERANCE = 1.0
 """Pixels by which intrinsics may differ from those that OpenCV gives; its versions differ by less."""
 
@@ -162,7 +159,6 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     longest = LARGEST_SPAN_RATIO * int(pose_times[-1] - pose_times[0])
     frame_files, stamps, frame_times = _read_frames(images, event_camera, longest, notes)
     zero = int(min(events.first_time, pose_times[0], *stamps[:1]))
-    _note_gaps(poses_file, pose_times, zero, notes)
 
     if is_prepared:
         rig = _read_prepared_rig(folder, event_camera, sequence, frame_files, notes)
@@ -259,18 +255,6 @@ def _check_unit(path: Path, times: Int64[np.ndarray, " rows"], longest: int) -> 
         raise RecordingError(
             f"{path} has times {np.median(steps) * 1e-3:g} us apart (median) over {steps.sum() * 1e-9:g} s, which "
             "fits no recording; microseconds were expected."
-        )
-
-
-def _note_gaps(path: Path, times: Int64[np.ndarray, " poses"], zero: int, notes: list[str]) -> None:
-    steps = np.diff(times)
-    gaps = np.flatnonzero(steps > LONGEST_GAP)
-    if len(gaps):
-        longest = gaps[np.argmax(steps[gaps])]
-        start, end = ((times[longest : longest + 2] - zero) * 1e-9).tolist()
-        notes.append(
-            f"{path.name} lacks poses {len(gaps)} times for longer than {LONGEST_GAP * 1e-9:g} s, longest from "
-            f"{start:.3f} s to {end:.3f} s, where poses are interpolated and wrong; use a part without such gaps."
         )
 
 

@@ -20,7 +20,7 @@ from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import HeldOutView, held_out_views
@@ -119,7 +119,7 @@ def camera_path(cameras: Cameras) -> dict:
     if len(poses) == 1:
         poses = np.repeat(poses, 2, axis=0)
     flight = Trajectory(np.arange(len(poses)) * 10**9, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat())
-    times = np.linspace(flight.start, flight.end, int(VIDEO_SECONDS * VIDEO_FPS)).astype(np.int64)
+    times = evenly_spaced(flight.start, flight.end, int(VIDEO_SECONDS * VIDEO_FPS))
     matrices = np.concatenate(
         [flight.poses(torch.from_numpy(times)).numpy(), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(times), 1, 1))], axis=1
     )

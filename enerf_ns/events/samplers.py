@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
@@ -30,6 +30,9 @@ class EventPairSampler:
     Between the events of other pairs the pixel is blind too, and what changes meanwhile is missing from the sum of
     their events: these pairs are approximate.
 
+    Where `stretches` leave gaps, the instants within these are none: the instants before and after are neighbours, and
+    of their pair, which counts the events of the gap, what was said of the other pairs holds. Windows end at gaps.
+
     Args:
         index: The events; batches come out on its device.
         mode: Which pairs there are.
@@ -37,6 +40,7 @@ class EventPairSampler:
         window_ns: For mode window, at least 1.
         uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are, and so
             are all pairs of a pixel.
+        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
 
     Raises:
         ValueError: There is no pair to draw, or an argument is outside its range.
@@ -49,6 +53,7 @@ class EventPairSampler:
         max_distance: int = 30,
         window_ns: int = 60_000_000,
         uniform_over: Literal["pairs", "pixels"] = "pairs",
+        stretches: Int64[Tensor, "stretches 2"] | None = None,
     ):
         if max_distance < 1 or window_ns < 1:
             raise ValueError(
@@ -59,8 +64,12 @@ class EventPairSampler:
         self.max_distance = 1 if mode == "successor" else max_distance
 
         instants = _last_of_each(index)
+        if stretches is not None:
+            _drop_outside(instants, index, stretches)
         if self.window:
-            lasts = _last_of_each(index, window_ns)
+            lasts = _last_of_each(index, window_ns, stretches)
+            if stretches is not None:
+                _drop_outside(lasts, index, stretches)
             instants &= ~lasts
             self._lasts = _places(lasts)
             del lasts  # it takes a byte an event
@@ -80,6 +89,7 @@ class EventPairSampler:
         self.num_pairs = int(self._pair_offsets[-1])
         if self.num_pairs == 0:
             where = f" within a window of {window_ns * 1e-6:g} ms" if self.window else ""
+            where += " outside the gaps of the poses" if stretches is not None else ""
             raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
         self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
 
@@ -124,19 +134,20 @@ class EventPairSampler:
 class SilentPixelSampler:
     """Draws pixels and two instants between which they fired nothing, for the no-event loss of E-NeRF.
 
-    A pixel is drawn uniformly over the sensor, hot pixels left out, and an instant uniformly over the recording; the
-    silent interval around it is bounded by the pixel's neighbouring events, or the recording's ends, and begins when
-    the pixel can see again. From an interval at least `min_duration_ns` long, two instants are drawn uniformly, at most
-    `max_duration_ns` apart and never at an event.
+    A pixel is drawn uniformly over the sensor, hot pixels left out, and an instant uniformly over the recording, or its
+    stretches; the silent interval around it is bounded by the pixel's neighbouring events, or the ends of the recording
+    or of the stretch, and begins when the pixel can see again. From an interval at least `min_duration_ns` long, two
+    instants are drawn uniformly, at most `max_duration_ns` apart and never at an event.
 
     Args:
         index: The events; batches come out on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         min_duration_ns: At least 1.
         max_duration_ns: At least 2.
+        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
 
     Raises:
-        ValueError: A duration is shorter than its minimum.
+        ValueError: A duration is shorter than its minimum, or no stretch lies between start and end.
     """
 
     ROUNDS = 32
@@ -148,6 +159,7 @@ class SilentPixelSampler:
         end_ns: int,
         min_duration_ns: int,
         max_duration_ns: int,
+        stretches: Int64[Tensor, "stretches 2"] | None = None,
     ):
         if min_duration_ns < 1 or max_duration_ns < 2:
             raise ValueError(
@@ -160,6 +172,14 @@ class SilentPixelSampler:
         usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
         usable[index.hot_pixels] = False
         self._pixels = usable.nonzero()[:, 0]
+        self._stretches = None
+        if stretches is not None:
+            begins, ends = stretches.clamp(start_ns, end_ns).T
+            used = (stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)
+            if not used.any():
+                raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
+            begins, ends = begins[used], ends[used]
+            self._stretches = begins, ends, (ends - begins + 1).cumsum(0)
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
@@ -194,31 +214,66 @@ class SilentPixelSampler:
         times, offsets = self.index.times, self.index.offsets
         chosen = torch.randint(len(self._pixels), (draws,), generator=generator, device=times.device)
         pixels = self._pixels[chosen]
-        instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=times.device)
+        instant, start_ns, end_ns = self._instants(draws, generator)
         first, stop = offsets[pixels], offsets[pixels + 1]
         following = first + self.index.count_until(pixels, instant)
         previous_time = times[(following - 1).clamp(min=0)]
         following_time = times[following.clamp(max=len(times) - 1)]
-        begin = torch.where(following > first, previous_time + blind_ns, self.start_ns).clamp(min=self.start_ns)
-        end = torch.where(following < stop, following_time - 1, self.end_ns).clamp(max=self.end_ns)
+        begin = torch.where(following > first, previous_time + blind_ns, start_ns).clamp(min=start_ns)
+        end = torch.where(following < stop, following_time - 1, end_ns).clamp(max=end_ns)
         usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
         end = torch.minimum(end, instant + self.max_duration_ns // 2)
         return pixels[usable], begin[usable], end[usable]
 
+    def _instants(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor | int, Tensor | int]:
+        """Instants drawn at random, and the first and the last instant of the stretches that they lie in."""
+        device = generator.device
+        if self._stretches is None:
+            instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=device)
+            return instant, self.start_ns, self.end_ns
+        begins, ends, after = self._stretches
+        place = torch.randint(int(after[-1]), (draws,), generator=generator, device=device)
+        stretch = torch.searchsorted(after, place, right=True)
+        return ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
 
-def _last_of_each(index: EventIndex, window_ns: int | None = None) -> Bool[Tensor, " events"]:
-    """Whether each event is the last of its pixel at this time, or in its window of time since the first event."""
+
+def _last_of_each(
+    index: EventIndex, window_ns: int | None = None, stretches: Int64[Tensor, "stretches 2"] | None = None
+) -> Bool[Tensor, " events"]:
+    """Whether each event is the last of its pixel at this time, or in its window of time since the first event.
+
+    Args:
+        index: The events.
+        window_ns: Length of the windows; None: the same time.
+        stretches: Whose ends end windows too.
+    """
     times = index.times
     origin = index.span[0] if window_ns is not None and len(times) else 0
     last = torch.ones(len(times), dtype=torch.bool, device=times.device)
     for first in range(0, len(times) - 1, CHUNK):
         values = times[first : first + CHUNK + 1]
+        part = None if stretches is None else _part(values, stretches)
         if window_ns is not None:
             values = (values - origin) // window_ns
-        last[first : first + CHUNK][: len(values) - 1] = values[1:] != values[:-1]
+        chunk = last[first : first + len(values) - 1]
+        chunk[:] = values[1:] != values[:-1]
+        if part is not None:
+            chunk |= part[1:] != part[:-1]
     last[index.offsets[1:][index.offsets.diff() > 0] - 1] = True
     return last
+
+
+def _drop_outside(chosen: Bool[Tensor, " events"], index: EventIndex, stretches: Int64[Tensor, "stretches 2"]) -> None:
+    """Chooses no events outside of the stretches."""
+    for first in range(0, len(chosen), CHUNK):
+        chosen[first : first + CHUNK] &= _part(index.times[first : first + CHUNK], stretches) % 2 == 1
+
+
+def _part(times: Int64[Tensor, " times"], stretches: Int64[Tensor, "stretches 2"]) -> Int64[Tensor, " times"]:
+    """Numbers of the parts that stretches cut time into: 0 before the first, 1 within it, 2 in the gap behind it ..."""
+    begins, ends = stretches.T.contiguous()
+    return torch.searchsorted(begins, times, right=True) + torch.searchsorted(ends, times)
 
 
 def _places(chosen: Bool[Tensor, " events"]) -> Int32[Tensor, " chosen"]:

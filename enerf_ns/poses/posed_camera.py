@@ -20,6 +20,7 @@ class PosedCamera:
         camera: With its distortion.
         trajectory: Of this camera.
         transform: [R | t] of the scene, shape (3, 4): a point p of the recording's world lies at scale * (R p + t).
+            In float64, since the world's origin may be far away.
         scale: Scene units per metre.
         device: Of the rays.
     """
@@ -28,12 +29,12 @@ class PosedCamera:
         self,
         camera: Camera,
         trajectory: Trajectory,
-        transform: Float[Tensor, "3 4"],
+        transform: Float64[Tensor, "3 4"],
         scale: float,
         device: torch.device | str = "cpu",
     ):
         self.camera, self.trajectory, self.scale = camera, trajectory, scale
-        self._transform = transform.double().to(device)
+        self._transform = transform.to(device)
         directions = camera.pixel_directions().reshape(-1, 3)
         norms = np.linalg.norm(directions, axis=-1, keepdims=True)
         self._directions = torch.from_numpy(directions / norms).float().to(device)

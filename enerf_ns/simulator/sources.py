@@ -303,7 +303,8 @@ class TrainedRun:
         self._model, self._lock = pipeline.model, Lock()
         self._renders_z_depth = isinstance(self._model, SplatfactoModel)
         outputs = pipeline.datamanager.train_dataparser_outputs
-        self._transform = outputs.dataparser_transform[:3].double().numpy()
+        transform = outputs.metadata.get("transform", outputs.dataparser_transform)
+        self._transform = transform[:3].double().numpy()
         self._scale = float(outputs.dataparser_scale)
         recording = outputs.metadata.get("recording")
         self._is_linear = isinstance(recording, EventRecording)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.depth_range import estimate_depth_range
+from enerf_ns.dataparsers.depth_range import estimate_depth_range, scene_depth_range
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
@@ -72,6 +73,30 @@ def test_range_holds_the_depths_of_the_points(near, far, positions, rotations):
     true_near, true_far = np.percentile(depths, [1, 99])
     assert 0.5 * true_near < estimated_near < true_near
     assert true_far < estimated_far < 2 * true_far
+
+
+def test_the_clock_does_not_matter():
+    events, trajectory, _ = recording_of_points(points_between(1, 3), shaking(0.03), TURNING)
+    expected = estimate_depth_range(events, CAMERA, trajectory)
+    for zero in (1_600_000_000_123_456_789, 2**62 - 10**10):
+        later = Trajectory(trajectory.times + zero, trajectory.positions, trajectory.quaternions)
+        moved = Events(events.x, events.y, events.t + zero, events.p)
+        assert estimate_depth_range(moved, CAMERA, later) == expected
+
+
+def test_events_in_a_gap_of_the_poses_do_not_count():
+    """Nor does the way that the spline takes through the gap; where they do, the range is another."""
+    events, trajectory, depths = recording_of_points(points_between(1, 3), shaking(0.1), TURNING)
+    known = (trajectory.times <= 700_000_000) | (trajectory.times >= 1_300_000_000)
+    cut = Trajectory(trajectory.times[known], trajectory.positions[known], trajectory.quaternions[known])
+    recording = EventRecording(Path("memory"), "test", CAMERA, cut, lambda: iter([events]), ())
+    near, far = scene_depth_range(recording)
+    true_near, true_far = np.percentile(depths, [1, 99])
+    assert 0.5 * true_near < near < true_near and true_far < far < 2 * true_far
+    posed = known[events.t // 1_000_000]
+    outside = Events(events.x[posed], events.y[posed], events.t[posed], events.p[posed])
+    assert (near, far) == pytest.approx(estimate_depth_range(outside, CAMERA, trajectory), rel=0.1)
+    assert (near, far) != scene_depth_range(replace(recording, keep_pose_gaps=True))
 
 
 def test_an_orbit_around_a_ball():

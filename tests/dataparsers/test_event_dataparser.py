@@ -79,7 +79,7 @@ def test_an_event_ray_meets_every_point_that_the_pixel_sees_at_that_time(tmp_pat
     folder = FORMATS[format](tmp_path / format)
     outputs, recording = parse(folder), read_recording(folder)
     camera = recording.camera
-    posed = PosedCamera(camera, recording.trajectory, outputs.dataparser_transform, outputs.dataparser_scale)
+    posed = PosedCamera(camera, recording.trajectory, outputs.metadata["transform"], outputs.dataparser_scale)
     pixels = np.array([[0, 0], [23, 17], [3, 4], [12, 9]])
     times = np.array([0, 123_456_789, 550_000_001, 1_000_000_000])
     depths = [0.5, 1.0, 2.0, 4.0]
@@ -95,7 +95,7 @@ def test_rays_of_events_and_of_frames_agree(tmp_path: Path):
     outputs, recording = parse(folder), read_recording(folder)
     time = int(outputs.metadata["frames"].times[0])
     frame = outputs.cameras.generate_rays(camera_indices=0, keep_shape=True).flatten()
-    transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
+    transform, scale = outputs.metadata["transform"], outputs.dataparser_scale
     event = PosedCamera(recording.camera, recording.trajectory, transform, scale).rays(
         torch.arange(24 * 18), torch.full((24 * 18,), time)
     )

@@ -161,6 +161,28 @@ def test_each_problem_is_found_alone(name: str):
     assert problem.what.endswith(".") and problem.advice.endswith(".")
 
 
+@pytest.mark.parametrize("zero", [3600 * SECOND, 1_600_000_000 * SECOND, 4_611_686_010 * SECOND])
+@pytest.mark.parametrize("name", [None, *PROBLEMS])
+def test_problems_are_the_same_on_every_clock(name: str | None, zero: int):
+    """But for the seconds that the clock shows; and a range of time that is advised avoids what it should."""
+    changes = PROBLEMS[name][0] if name else {}
+    events, poses = changes.get("events"), changes.get("poses") or good_poses()
+    events = (good_events(np.random.default_rng(0)) if events is None else events) + [0, 0, zero, 0]
+    frame_times = changes.get("frame_times", FRAME_TIMES) + zero
+    later = made(**{**changes, "events": events, "poses": (poses[0] + zero, *poses[1:]), "frame_times": frame_times})
+    problems, expected = find_problems(later), find_problems(made(**changes))
+    assert len(problems) == len(expected) == (name is not None)
+    for problem, usual in zip(problems, expected, strict=True):
+        shown = re.sub(r"\d{4,}\.\d+ s", lambda match: f"{float(match[0][:-2]) - zero / SECOND:.2f} s", problem.what)
+        assert shown == usual.what
+        statistics = event_statistics(later)
+        spans = np.concatenate([pose_gaps(later, statistics), *unusual_rates(later, statistics, None)])
+        for first, last in re.findall(r"--time-range (\S+?) ([\d.]+\d)", problem.advice):
+            start, end = later.selected((float(first), float(last)), keep_hot_pixels=False).time_range or (0, 0)
+            assert start < end and not ((spans[:, 0] < end) & (spans[:, 1] > start)).any()
+            assert statistics.edges[0] <= start and end <= statistics.edges[-1]
+
+
 def test_a_recording_without_frames_needs_none():
     assert find_problems(made(frame_times=FRAME_TIMES[:0])) == []
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,38 @@ def test_frames_outside_the_poses_are_dropped_and_counted():
 def test_nothing_is_noted_when_nothing_is_dropped():
     whole = recording(np.array([[1, 2, 0, 1], [1, 2, 100, 1]]), frame_times=(0, 100))
     assert len(index_events(whole).events()) == 2 and whole.notes == index_events(whole).notes == ()
+
+
+def with_gaps(*pieces: tuple[int, int]) -> EventRecording:
+    """A recording whose poses, ten milliseconds apart, lie within these pieces of time (ms) alone."""
+    times = np.concatenate([np.arange(first, last + 1, 10) for first, last in pieces]) * 1_000_000
+    still = np.zeros((len(times), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    return replace(recording(np.array([[1, 2, 0, 1], [1, 2, 10**9, 1]])), trajectory=Trajectory(times, *still))
+
+
+PIECES = (0, 200), (400, 400), (600, 600), (800, 1000)
+
+
+@pytest.mark.parametrize("time_range", [None, (0.1, 0.9), (0.15, 0.5), (0.3, 0.4), (0.21, 0.61)])
+def test_stretches_are_what_the_gaps_leave_of_the_span(time_range: tuple[float, float] | None):
+    """By looking at every millisecond."""
+    whole = with_gaps(*PIECES)
+    chosen = whole.selected(time_range, keep_hot_pixels=False)
+    start, end = (0, 1000) if time_range is None else (round(1000 * time_range[0]), round(1000 * time_range[1]))
+    used = [m for m in range(start, end + 1) if any(first <= m <= last for first, last in PIECES)]
+    milliseconds = chosen.stretches // 1_000_000
+    assert [m for first, last in milliseconds.tolist() for m in range(first, last + 1)] == used
+    gaps = [(a, b) for (_, a), (b, _) in pairwise(PIECES) if a < end and b > start]
+    assert (chosen.pose_gaps // 1_000_000).tolist() == [[*gap] for gap in gaps]
+
+    instants = chosen.instants(500)
+    assert {t // 1_000_000 for t in instants.tolist()} <= set(used) and not chosen.in_left_out_gaps(instants).any()
+    assert (instants[0], instants[-1]) == (used[0] * 1_000_000, used[-1] * 1_000_000)
+    assert len(np.unique(instants)) == min(500, sum(last - first + 1 for first, last in chosen.stretches.tolist()))
+    kept = whole.selected(time_range, keep_hot_pixels=False, keep_pose_gaps=True)
+    assert kept.stretches.tolist() == [[start * 1_000_000, end * 1_000_000]] and kept.span == chosen.span
+    assert (kept.pose_gaps == chosen.pose_gaps).all() and not kept.in_left_out_gaps(np.arange(0, 10**9, 10**6)).any()
+    assert kept is whole.selected(time_range, False, True) is chosen.selected(time_range, False, True) or time_range
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import torch
 from scipy.interpolate import CubicSpline, interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 
 def random_trajectory(rng: np.random.Generator, num_poses: int, start: int = 0) -> Trajectory:
@@ -124,6 +124,35 @@ def test_rotations_are_orthonormal() -> None:
         rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand_as(rotations), rtol=0, atol=1e-13
     )
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(len(rotations), dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [(0, 10**9), (0, 7), (5, 5), (-(2**62), 2**62 - 1), (1_600_000_000_123_456_789, 1_600_003_600_123_456_790)],
+)
+@pytest.mark.parametrize("number", [2, 3, 50, 2000])
+def test_instants_are_spaced_exactly(start: int, end: int, number: int) -> None:
+    instants = evenly_spaced(start, end, number)
+    expected = [start + (end - start) * i // (number - 1) for i in range(number)]  # of any size, in Python
+    assert instants.dtype == np.int64 and instants.tolist() == expected and expected[-1] == end
+
+
+@pytest.mark.parametrize("start", [0, 1_600_000_000_123_456_789])
+def test_gaps_are_longer_than_the_rate_explains(start: int) -> None:
+    """Over ten times the median step and over a tenth of a second, against a loop; two may follow each other."""
+    for milliseconds in ([5] * 30 + [100, 101, 300, 5, 5, 400], [50] * 30 + [500, 501, 502, 50, 300], [1] * 9, [10**6]):
+        times = start + np.cumsum([0, *milliseconds]) * 1_000_000
+        still = np.zeros((len(times), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+        trajectory = Trajectory(times, *still)
+        limit = max(10 * sorted(milliseconds)[len(milliseconds) // 2], 100)
+        assert trajectory.longest_step == limit * 1_000_000
+        expected = [
+            (int(a), int(b)) for a, b, step in zip(times[:-1], times[1:], milliseconds, strict=True) if step > limit
+        ]
+        assert trajectory.gaps.tolist() == [[*pair] for pair in expected]
+        around = np.unique(np.concatenate([times - 1, times, times + 1, (times[:-1] + times[1:]) // 2]))
+        inside = [any(a < time < b for a, b in expected) for time in around.tolist()]
+        assert trajectory.in_gaps(around).tolist() == inside
 
 
 def test_batch_shapes() -> None:

@@ -22,6 +22,8 @@ WIDTH, HEIGHT = 5, 4
 MODES = ["successor", "partner", "window"]
 WINDOW = 100
 START, END = 50, 1000
+STRETCHES = [(0, 199), (330, 331), (450, 450), (500, 2000)]
+"""First and last instant of the parts of time that poses cover, in the tests of gaps."""
 
 
 def make_events(rows: list[tuple[int, int, int]]) -> Events:
@@ -48,15 +50,22 @@ def index_of(pixels: dict[int, list[tuple[int, int]]], device: str = "cpu") -> E
     return EventIndex.from_events(events, WIDTH, HEIGHT).to(device)
 
 
-def all_pairs(pixels: dict, mode: str, max_distance: int) -> list[tuple[int, int, int]]:
+def stretch_of(time: int) -> int | None:
+    """Number of the stretch that a time lies in, by a loop; None in a gap."""
+    return next((i for i, (first, last) in enumerate(STRETCHES) if first <= time <= last), None)
+
+
+def all_pairs(pixels: dict, mode: str, max_distance: int, gaps: bool = False) -> list[tuple[int, int, int]]:
     """Every (pixel, start, end) that a mode may draw, by loops."""
     origin = min(t for events in pixels.values() for t, _ in events)
     pairs = []
     for pixel, events in pixels.items():
-        instants = sorted({t for t, _ in events})
+        instants = sorted({t for t, _ in events if not gaps or stretch_of(t) is not None})
         for i, start in enumerate(instants):
             if mode == "window":
                 same_window = [t for t in instants if (t - origin) // WINDOW == (start - origin) // WINDOW]
+                if gaps:
+                    same_window = [t for t in same_window if stretch_of(t) == stretch_of(start)]
                 ends = same_window[-1:] if start != same_window[-1] else []
             else:
                 ends = instants[i + 1 : i + 1 + (1 if mode == "successor" else max_distance)]
@@ -120,6 +129,70 @@ def test_pairs_are_uniform_and_count_their_events(mode, uniform_over, equal_stam
     per_pixel = Counter(pixel for pixel, _, _ in expected)
     weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
     assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 7, 2**20])
+@pytest.mark.parametrize("uniform_over", ["pairs", "pixels"])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize("mode", MODES)
+def test_no_pair_starts_or_ends_in_a_gap(mode, equal_stamps: bool, uniform_over, chunk: int, monkeypatch, device: str):
+    """All pairs of the instants outside the gaps, as likely as ever, with all events between their instants."""
+    monkeypatch.setattr(event_sampler, "CHUNK", chunk)
+    pixels = recording(equal_stamps)
+    expected = all_pairs(pixels, mode, 3, gaps=True)
+    spanning = [pair for pair in expected if stretch_of(pair[1]) != stretch_of(pair[2])]
+    assert bool(spanning) == (mode != "window")
+    stretches = torch.tensor(STRETCHES, device=device)
+    sampler = EventPairSampler(index_of(pixels, device), mode, 3, WINDOW, uniform_over, stretches)
+    assert sampler.num_pairs == len(expected)
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(1))
+    assert_counts_are_right(pairs, pixels)
+    drawn = Counter(rows(pairs))
+    assert set(drawn) == set(expected)
+    per_pixel = Counter(pixel for pixel, _, _ in expected)
+    weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
+    assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_events_in_gaps_alone_make_no_pair(mode) -> None:
+    index = index_of({1: [(t, 1) for t in range(200, 330)], 2: [(10, 1)]})
+    with pytest.raises(ValueError, match="outside the gaps of the poses, so there is no pair"):
+        EventPairSampler(index, mode, stretches=torch.tensor(STRETCHES))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_pixel_that_fires_ten_thousand_times_in_a_millisecond_beside_pixels_with_two(mode) -> None:
+    """All pairs are alike, or all pixels; in either case the sums are those of a loop over the stamps."""
+    generator = np.random.default_rng(0)
+    burst = np.sort(generator.integers(10**9, 10**9 + 10**6, 10_000))
+    pixels = {7: [(int(t), int(p)) for t, p in zip(burst, generator.choice([-1, 1], 10_000), strict=True)]}
+    pixels |= {pixel: [(10**9 + pixel, 1), (10**9 + 500 + pixel, -1)] for pixel in range(WIDTH * HEIGHT) if pixel != 7}
+    index = index_of(pixels)
+    times, polarities = np.array(pixels[7]).T
+    instants = len(np.unique(times))
+    most = {"successor": instants - 1, "partner": sum(instants - d for d in range(1, 31)), "window": instants - 1}
+    for uniform_over in ("pairs", "pixels"):
+        sampler = EventPairSampler(index, mode, 30, 10**6, uniform_over)
+        assert sampler.num_pairs == most[mode] + 19
+        pairs = sampler.sample(4000, torch.Generator().manual_seed(0))
+        for (pixel, start, end), on, off in zip(rows(pairs), pairs.on.tolist(), pairs.off.tolist(), strict=True):
+            assert start < end
+            if pixel == 7:
+                fired = polarities[np.searchsorted(times, start, "right") : np.searchsorted(times, end, "right")]
+                assert (on, off) == ((fired == 1).sum(), (fired == -1).sum())
+            else:
+                assert (end - start, on, off) == (500, 0, 1)
+        in_burst = int((pairs.pixels == 7).sum())
+        if uniform_over == "pixels":
+            assert chisquare(np.bincount(pairs.pixels.numpy(), minlength=20)).pvalue > 1e-3
+        else:
+            assert in_burst > 3980
+    silent = SilentPixelSampler(index, *index.span, 100, 100).sample(2000, torch.Generator().manual_seed(1))
+    assert len(silent) == 2000
+    for pixel, start, end in rows(silent):
+        assert not any(start < t <= end for t, _ in pixels[pixel]) or pixel == 7
+        assert pixel != 7 or np.searchsorted(times, start, "right") == np.searchsorted(times, end, "right")
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 7])
@@ -258,14 +331,16 @@ def test_no_event_at_all_is_an_error() -> None:
             EventPairSampler(empty, mode)
 
 
-def silent_stretches(pixels: dict, start: int, end: int, refractory: int = 0) -> dict[int, list[tuple[int, int]]]:
+def silent_stretches(
+    pixels: dict, start: int, end: int, refractory: int = 0, gaps: bool = False
+) -> dict[int, list[tuple[int, int]]]:
     """First and last instant of every stretch of each pixel without an event, by a loop over instants."""
     stretches = defaultdict(list)
     for pixel in range(WIDTH * HEIGHT):
         times = {t + blind for t, _ in pixels.get(pixel, []) for blind in range(max(refractory, 1))}
         begin = None
         for instant in range(start, end + 2):
-            silent = instant <= end and instant not in times
+            silent = instant <= end and instant not in times and not (gaps and stretch_of(instant) is None)
             if silent and begin is None:
                 begin = instant
             elif not silent and begin is not None:
@@ -315,6 +390,35 @@ def test_silent_pixels_are_drawn_in_proportion_to_their_silence(refractory: int)
     assert not drawn[silence == 0].any()
     expected = silence[silence > 0] * (20_000 / silence.sum())
     assert chisquare(drawn[silence > 0], expected).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("start", "end"), [(START, END), (0, 2500), (250, 480)])
+@pytest.mark.parametrize("refractory", [0, 60])
+def test_silent_pixels_keep_out_of_gaps(start: int, end: int, refractory: int, device: str) -> None:
+    """Every instant outside the gaps is as likely as the others to be looked around."""
+    pixels = recording(False)
+    stretches = silent_stretches(pixels, start, end, refractory, gaps=True)
+    shortest = 50 if end > 500 else 1
+    long_enough = {pixel: [(a, b) for a, b in found if b - a >= shortest] for pixel, found in stretches.items()}
+    parts = torch.tensor(STRETCHES, device=device)
+    sampler = SilentPixelSampler(index_of(pixels, device), start, end, shortest, 200, parts)
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(3), refractory)
+    assert len(pairs) == 20_000
+    assert_counts_are_right(pairs, pixels)
+    drawn = Counter()
+    for pixel, a, b in rows(pairs):
+        assert a < b <= a + 200
+        (around,) = [(first, last) for first, last in long_enough[pixel] if first <= a and b <= last]
+        drawn[pixel, around] += 1
+    silence = {(pixel, (a, b)): b - a + 1 for pixel, found in long_enough.items() for a, b in found}
+    assert set(drawn) <= set(silence)
+    expected = np.array([*silence.values()]) * (20_000 / sum(silence.values()))
+    assert chisquare([drawn[key] for key in silence], expected).pvalue > 1e-3
+
+
+def test_a_recording_in_one_gap_shows_no_silence() -> None:
+    with pytest.raises(ValueError, match="All events lie in one gap"):
+        SilentPixelSampler(index_of(recording(False)), 210, 320, 1, 100, torch.tensor(STRETCHES))
 
 
 def test_two_instants_of_a_silent_pixel_are_uniform() -> None:
