@@ -106,7 +106,7 @@ def resolve(config: PipelineConfig, recording: EventRecording, preset: str | Non
 
     Raises:
         RecordingError: The depth of the scene cannot be measured, or a preset selects frames that are not there.
-        FlagError: A setting is out of its range, or asks for what the recording does not have.
+        FlagError: A setting asks for what there is not.
     """
     return _Resolver(config, recording, preset).resolution()
 
@@ -183,10 +183,10 @@ class _Resolver:
         every = self.parser.held_out_every if self.parser.held_out_every is not None else DEFAULT_HELD_OUT_EVERY
         frames = recording.blurred_frames or recording.frames
         num_frames = len(frames.times) if frames else 0
-        if every < 1 or ("frames" in supervision and not 1 <= every // 2 < num_frames):
+        if "frames" in supervision and not 1 <= every // 2 < num_frames:
             raise FlagError(
                 f"{recording.path}: --held-out-every {every} splits none of {num_frames} frames off; it "
-                "must be at least 1, and where the field learns from frames at least 2 and less than twice their number"
+                "must be at least 2 and less than twice their number, where the field learns from frames"
             )
 
     def _events(self) -> None:
@@ -194,8 +194,6 @@ class _Resolver:
         data, defaults, recording = self.config.datamanager, self.config.defaults, self.recording
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)
-        if blind < 0:
-            raise FlagError(f"--refractory-period-ns is {blind}, but it must be at least 0.")
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
         if "events" not in data.supervision:
             self.row("event loss", False, "", f"supervision is {data.supervision}")
@@ -227,8 +225,6 @@ class _Resolver:
             return thresholds_from_polarity(*counts)
 
         thresholds = self.use(name, from_recording)
-        if not min(thresholds) > 0.0:
-            raise FlagError(f"--contrast-thresholds are {tuple(thresholds)}, but both must be above 0")
         why = "the recording states them"
         if counts is not None:
             why = f"{counts[0]:,} on and {counts[1]:,} off events; their mean is assumed"

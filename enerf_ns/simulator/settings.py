@@ -140,6 +140,7 @@ def _check_ranges(settings: SimulationSettings) -> None:
         ("width", lambda v: 0 < v < 2**15, "pixels above 0"),
         ("height", lambda v: 0 < v < 2**15, "pixels above 0"),
         ("field_of_view", lambda v: 0 < v < 180, "degrees between 0 and 180"),
+        ("frames_per_second", lambda v: 1e-3 <= v <= 1e6, "from 0.001 to 1000000"),
         ("max_displacement", lambda v: 0 < v < np.inf, "pixels above 0"),
         ("max_change", lambda v: 0 < v < np.inf, "a change of log brightness above 0"),
         ("bayer_pattern", lambda v: len(v) == 4 and set(v) <= set("RGB"), "four letters of R, G and B"),

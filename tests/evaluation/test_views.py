@@ -21,14 +21,14 @@ HELD_OUT = [2, 6, 10]
 
 @pytest.fixture
 def shown(run: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A pipeline whose field shows a wall parallel to every picture, brighter to the right and from view to view."""
+    """A pipeline whose field shows a wall parallel to every picture, darker to the right and brighter from view to view."""
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     calls = []
 
     def outputs(rays: Any) -> dict[str, torch.Tensor]:
         height, width = rays.shape
         calls.append(rays)
-        brightness = torch.linspace(0.1, 0.5, width).expand(height, width)[..., None] + 0.1 * len(calls)
+        brightness = torch.linspace(0.5, 0.1, width).expand(height, width)[..., None] + 0.1 * len(calls)
         return {
             "rgb": brightness.expand(-1, -1, 3),
             "depth": scale * METRES * rays.metadata["directions_norm"],
