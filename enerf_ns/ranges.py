@@ -12,7 +12,7 @@ from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, DEPTH_LIMITS, LONGEST_REFRACTORY_PERIOD
 
 if TYPE_CHECKING:
-    from enerf_ns.enerf_trainer import EnerfTrainerConfig
+    from nerfstudio.engine.trainer import TrainerConfig
 
 MOST_STEPS = 10**9
 MOST_DRAWS = 2**24
@@ -107,7 +107,7 @@ WITHOUT_FLAG = (
 """Parts of the config that can only be set from Python."""
 
 
-def check_ranges(config: EnerfTrainerConfig) -> None:
+def check_ranges(config: TrainerConfig) -> None:
     """Refuses a config that holds a number that is not finite, or one outside its range in `RANGES`.
 
     Raises:
@@ -121,13 +121,14 @@ def check_ranges(config: EnerfTrainerConfig) -> None:
     _check_order(config)
 
 
-def _check_order(config: EnerfTrainerConfig) -> None:
+def _check_order(config: TrainerConfig) -> None:
     """Refuses numbers that do not fit one another.
 
     Raises:
         FlagError: Names their flags.
     """
-    parser, model = config.pipeline.datamanager.dataparser, config.pipeline.model
+    pipeline: Any = config.pipeline
+    parser, model = pipeline.datamanager.dataparser, pipeline.model
     for name in ("depth_range", "time_range"):
         values = getattr(parser, name)
         if values is not None and not values[0] < values[1]:
@@ -144,11 +145,11 @@ def _check_order(config: EnerfTrainerConfig) -> None:
         )
     for group, parts in config.optimizers.items():
         scheduler = parts["scheduler"]
-        steps = scheduler.max_steps or config.max_num_iterations
-        if scheduler.warmup_steps >= steps:
+        warmup, steps = getattr(scheduler, "warmup_steps", 0), scheduler.max_steps or config.max_num_iterations
+        if warmup >= steps:
             raise FlagError(
-                f"--optimizers.{group}.scheduler.warmup-steps is {scheduler.warmup_steps}, but must be below the "
-                f"{steps} steps of the run."
+                f"--optimizers.{group}.scheduler.warmup-steps is {warmup}, but must be below the {steps} steps in which "
+                "the learning rate falls."
             )
 
 

@@ -199,7 +199,7 @@ def test_flags_of_messages_are_those_of_ns_train():
         ("parser", {"time_range": (3.0, 1.0)}, r"^event-data --time-range is 3 1, but the second .* above the first\.$"),
         ("parser", {"box": (0.0, 0.0, 0.0, 0.0)}, r"^event-data --box is 0 0 0 0, but half its side must be at least"),
         ("model", {"base_res": 65, "max_res": 64}, r"^--pipeline\.model\.max-res is 64, but .*base-res, which is 65\.$"),
-        ("scheduler", {"warmup_steps": 4000}, r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps"),
+        ("scheduler", {"warmup_steps": 4000}, r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps in"),
         ("scheduler", {"warmup_steps": 9, "max_steps": 9}, r"warmup-steps is 9, but must be below the 9 steps"),
         ("resolution", {"values": {"model.near_plane": math.nan}}, r"^pipeline\.resolution\.values\.model\.near_plane is"),
     ],

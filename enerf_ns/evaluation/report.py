@@ -153,6 +153,7 @@ def render_video(run: Run, camera_path_file: Path, output: Path) -> None:
 
     Raises:
         OSError: It cannot be written.
+        OutputError: The same, where it is ffmpeg that finds out.
     """
     from nerfstudio.scripts.render import RenderCameraPath
 
@@ -170,5 +171,9 @@ def render_video(run: Run, camera_path_file: Path, output: Path) -> None:
             depth_far_plane=scale * far,
         ).main()
         partial.replace(output)
+    except RuntimeError as error:
+        if not str(error).startswith("Error writing"):  # as mediapy says
+            raise
+        raise OutputError(f"{output} could not be written as a video; make room on the disk.") from error
     finally:
         partial.unlink(missing_ok=True)

@@ -109,7 +109,7 @@ class SensorSettings:
             else:
                 fine, expected = 0 <= value <= 1e15, "at least 0 and at most 1e15"
             if not fine:
-                raise FlagError(f"{field.name} is {value}, but must be {expected}.")
+                raise FlagError(f"--{field.name.replace('_', '-')} is {value}, but must be {expected}.")
 
 
 class PartialPicture(NamedTuple):
@@ -181,7 +181,7 @@ class EventSensor:
         without = np.count_nonzero((self.contrast_thresholds < CONTRAST_THRESHOLD_LIMITS[0]).any(0))
         if without:
             raise FlagError(
-                f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
+                f"--threshold-spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
                 f"threshold of {CONTRAST_THRESHOLD_LIMITS[0]} or more; give a smaller one."
             )
         self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))

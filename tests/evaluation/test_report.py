@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -179,3 +180,20 @@ def test_whatever_a_field_shows_the_report_is_whole_and_json(
         assert (table.get(name) is None) == (left_out == [0, 1, 2])
         assert len(set(left_out)) == len(left_out)
     assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
+
+
+@pytest.mark.slow
+def test_a_disk_too_small_for_the_video_is_one_sentence(run: Run, tmp_path: Path):
+    """By a limit of the size of files, which ffmpeg inherits."""
+    (tmp_path / "video.mp4").write_text("before")
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(camera_path(run.pipeline.datamanager.eval_dataset.cameras)))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises((OutputError, OSError)):
+            render_video(run, path, tmp_path / "video.mp4")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / "video.mp4").read_text() == "before"
+    assert {file.name for file in tmp_path.iterdir()} == {"video.mp4", "path.json"}
