@@ -91,7 +91,7 @@ class ErrorAgainstTime:
                 trained += time.perf_counter() - start
                 step += 1
             views, summary = held_out_views(pipeline)
-            row = {"setting": name, "seconds": round(trained, 1), "steps": step, **mean_scores(views)}
+            row = {"setting": name, "seconds": round(trained, 1), "steps": step, **mean_scores(views)[0]}
             rows.append(row | {"rays_per_second": summary["num_rays_per_sec"]})
             print(rows[-1], flush=True)
         picture = side_by_side(views, pipeline.datamanager.eval_dataset.recording)

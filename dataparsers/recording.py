@@ -26,6 +26,13 @@ LARGEST_SPAN_RATIO = 300
 LONGEST_REFRACTORY_PERIOD = 10**12
 """Longest refractory period, nanoseconds."""
 
+CONTRAST_THRESHOLD_LIMITS = (1e-3, 10.0)
+"""Least and largest contrast threshold, change of log brightness. Sensors have more than ten times the least, below
+which events beyond number would follow; the largest is a change of brightness by e^10, 22,000 times."""
+
+DEPTH_LIMITS = (1e-6, 1e9)
+"""Least and largest depth, metres."""
+
 SHORTEST_FRAME_STEP = 1_000_000
 """Shortest time from frame to frame, nanoseconds; frames closer together than this are in another unit if they also
 span hardly any of the poses."""
@@ -109,7 +116,7 @@ class EventRecording:
     held_out_frames: Frames | None = None
     """Views for evaluation alone, on a trajectory and a clock of their own."""
     contrast_thresholds: tuple[float, float] | None = None
-    """Contrast thresholds of on and of off events, above 0, where the recording knows them."""
+    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`, where the recording knows them."""
     refractory_period: int = 0
     """For how long a pixel is blind after an event, ns; at most 1000 s."""
     bayer_pattern: str | None = None
@@ -118,7 +125,7 @@ class EventRecording:
     """How the sensor answers brightness, in the words of `enerf_ns.sensor.response`: linlog, or logarithm:OFFSET; None
     where the recording does not state it."""
     depth_range: tuple[float, float] | None = None
-    """Nearest and farthest depth in metres, above 0, where the recording knows them."""
+    """Nearest and farthest depth in metres, within `DEPTH_LIMITS`, where the recording knows them."""
     notes: tuple[str, ...] = ()
     """What was dropped or renormalised, one sentence each; what is said of the events is with their index."""
     shares_outside_poses: dict[str, float] = field(default_factory=dict)
@@ -227,9 +234,11 @@ class EventRecording:
 
     def _check_what_is_stated(self) -> None:
         on, off = self.contrast_thresholds or (1.0, 1.0)
-        if not (0 < on < np.inf and 0 < off < np.inf):
+        least, largest = CONTRAST_THRESHOLD_LIMITS
+        if not (least <= on <= largest and least <= off <= largest):
             raise ValueError(
-                f"the contrast thresholds {on:g} (of on events) and {off:g} (of off events), but both must be above 0."
+                f"the contrast thresholds {on:g} (of on events) and {off:g} (of off events), but both must be from "
+                f"{least:g} to {largest:g}."
             )
         if not 0 <= self.refractory_period <= LONGEST_REFRACTORY_PERIOD:
             raise ValueError(
@@ -248,10 +257,10 @@ class EventRecording:
                 "logarithm:0.001, was expected."
             )
         near, far = self.depth_range or (1.0, 2.0)
-        if not 0 < near < far < np.inf:
+        if not DEPTH_LIMITS[0] <= near < far <= DEPTH_LIMITS[1]:
             raise ValueError(
                 f"the range of depth {near:g} m to {far:g} m, but the nearest and, farther than that, the farthest "
-                "depth, both above 0, were expected."
+                f"depth, both from {DEPTH_LIMITS[0]:g} m to {DEPTH_LIMITS[1]:g} m, were expected."
             )
 
     def _set(self, **values: object) -> None:

@@ -139,7 +139,7 @@ def resolve(
 
     Raises:
         RecordingError: The depth of the scene cannot be measured, or a preset selects frames that are not there.
-        FlagError: A setting is out of its range, or asks for what the recording does not have.
+        FlagError: A setting asks for what there is not.
     """
     return _Resolver(config, recording, preset, probe).resolution()
 
@@ -236,32 +236,31 @@ class _Resolver:
         every = self.parser.held_out_every if self.parser.held_out_every is not None else DEFAULT_HELD_OUT_EVERY
         frames = recording.blurred_frames or recording.frames
         num_frames = len(frames.times) if frames else 0
-        if every < 1 or ("frames" in supervision and not 1 <= every // 2 < num_frames):
+        if "frames" in supervision and not 1 <= every // 2 < num_frames:
             raise FlagError(
                 f"{recording.path}: --held-out-every {every} splits none of {num_frames} frames off; it "
-                "must be at least 1, and where the field learns from frames at least 2 and less than twice their number"
+                "must be at least 2 and less than twice their number, where the field learns from frames"
             )
 
     def _poses(self) -> None:
         """Whether what lies between poses that are far apart is used."""
-        recording, kept = self.recording, self.parser.keep_pose_gaps
+        recording, name, kept = self.recording, f"{DATAPARSER}.keep_pose_gaps", self.parser.keep_pose_gaps
         gaps = recording.pose_gaps
         if not len(gaps):
-            self.row("pose gaps", False, "", f"none is longer than {recording.trajectory.longest_step * 1e-9:.3g} s")
+            why = f"none is longer than {recording.trajectory.longest_step * 1e-9:.3g} s"
+            self.row("pose gaps", False, "", why, name)
             return
         index = index_events(recording)
         why = (
             f"{index.num_in_gaps:,} events ({100 * index.num_in_gaps / len(index):.2g} %) lie in {describe_gaps(gaps)}"
         )
-        self.row("pose gaps", kept, "used" if kept else "left out", "set by flag; " * kept + why)
+        self.row("pose gaps", kept, "used" if kept else "left out", "set by flag; " * kept + why, name)
 
     def _events(self) -> None:
         """Which pairs are drawn."""
         data, defaults, recording = self.config.datamanager, self.config.defaults, self.recording
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)
-        if blind < 0:
-            raise FlagError(f"--refractory-period-ns is {blind}, but it must be at least 0.")
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
         if not self.use_events:
             self.row("event loss", False, "", f"supervision is {data.supervision}", "datamanager.supervision")
@@ -314,8 +313,6 @@ class _Resolver:
             return thresholds_from_polarity(*counts)
 
         on, off = self.use(name, from_recording)
-        if not min(on, off) > 0.0:
-            raise FlagError(f"--contrast-thresholds are {(on, off)}, but both must be above 0")
         why = "the recording states them"
         if counts is not None:
             why = f"{counts[0]:,} on and {counts[1]:,} off events; their mean is assumed"

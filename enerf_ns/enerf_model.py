@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from enerf_ns.enerf_field import EnerfField, HashDensity
-from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
+from enerf_ns.evaluation.metrics import align_brightness, align_channels, fit_fault, image_metrics
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ray_samplers import PairedPDFSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
@@ -265,15 +265,25 @@ class EnerfModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once.
 
-        A picture of events has no scores.
+        A picture of events has no scores, nor has one that cannot be aligned.
         """
         recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
         scores: dict[str, float] = {}
-        if batch["is_frame"]:
-            align = align_channels if self.sensor.colour_filter else align_brightness
-            rendered = align([rendered], [recorded])[0][0]
-            scores = image_metrics(rendered, recorded)
-        images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
+        if batch["is_frame"] and rendered.isfinite().all():
+            if self.sensor.colour_filter:
+                (aligned,), fits = align_channels([rendered], [recorded])
+            else:
+                (aligned,), fit = align_brightness([rendered], [recorded])
+                fits = [fit]
+            if fit_fault(fits) is None:
+                rendered = aligned
+                found = image_metrics(rendered, recorded)
+                scores = {name: score for name, score in found.items() if not isinstance(score, str)}
+        depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
+        images = {
+            "img": torch.cat([recorded, rendered.nan_to_num()], dim=1),
+            "depth": depth / depth.max().clamp(min=1e-12),
+        }
         return scores, images
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, Type  # noqa: UP035 - tyro reads these annotations on Py
 
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
@@ -16,8 +17,8 @@ from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import exit_with_a_sentence
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
-from enerf_ns.evaluation.metrics import correlation
-from enerf_ns.evaluation.scores import mean_scores
+from enerf_ns.evaluation.metrics import Score, correlation
+from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views, save_pictures
 from enerf_ns.ffmpeg import make_ffmpeg_available
 from enerf_ns.supervision.event_supervision import brightness_change
@@ -81,8 +82,9 @@ class EnerfPipeline(VanillaPipeline):
         return results
 
     @torch.no_grad()
-    def event_correlation(self, num_pairs: int = 8192) -> float:
-        """Linear correlation of rendered and measured changes of log brightness over random event pairs.
+    def event_correlation(self, num_pairs: int = 8192) -> Score:
+        """Linear correlation of rendered and measured changes of log brightness over random event pairs, or why there
+        is none.
 
         What can be said of a field whose recording has no frames; the pairs are drawn from those of the training.
         """
@@ -99,16 +101,24 @@ class EnerfPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean scores over the held-out frames: psnr, ssim, correlation, and lpips and depth_rmse where available.
-
-        For a recording without frames, only the correlation of its events.
+        """The `summary_scores` that have a value; what has none is printed, with the reason.
 
         Args:
             step: Ignored; Nerfstudio passes it.
             output_path: Folder for one picture a frame, recorded beside rendered.
             get_std: Give the standard deviation over the frames too.
+
+        Raises:
+            SystemExit: The pictures cannot be written; with one sentence.
         """
         views, summary = held_out_views(self)
         if output_path is not None:
-            save_pictures(views, output_path)
-        return summary | mean_scores(views, get_std)
+            with exit_with_a_sentence():
+                save_pictures(views, output_path)
+        scores = summary_scores(views, summary, get_std)
+        not_scored: Any = scores.pop("not_scored", {})
+        for name, reasons in not_scored.items():
+            for reason, numbers in reasons.items():
+                of = f" of {len(numbers)} of {len(views)} frames ({', '.join(map(str, numbers))})" if numbers else ""
+                CONSOLE.print(f"No {name}{of}: {reason}.", soft_wrap=True, highlight=False, markup=False)
+        return {name: value for name, value in scores.items() if value is not None}

@@ -23,6 +23,7 @@ from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
 from enerf_ns.probe import view_direction_gain
+from enerf_ns.ranges import check_ranges
 
 
 @dataclass
@@ -44,6 +45,7 @@ class EnerfTrainerConfig(TrainerConfig):
             RecordingError: The recording cannot be used.
             FlagError: A setting cannot be followed.
         """
+        check_ranges(self)
         config = deepcopy(self)
         pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
         data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)

@@ -81,11 +81,11 @@ def test_frames_that_are_not_there_cannot_be_learnt_from(recording: Path, tmp_pa
         ({"model__event_loss": "hubert"}, 4, "--pipeline.model.event-loss is 'hubert', but one of huber, squared"),
         ({"sensor__response": "log"}, 4, "--pipeline.model.response is the response 'log', but linlog, or"),
         ({"sensor__bayer_pattern": "RGBW"}, 4, "--pipeline.model.bayer-pattern is a colour filter 'RGBW', but"),
-        ({"sensor__refractory_period_ns": -1}, 4, "--refractory-period-ns is -1"),
-        ({}, 0, "--held-out-every 0"),
+        ({"sensor__refractory_period_ns": -1}, 4, "--pipeline.model.refractory-period-ns is -1, but"),
+        ({}, 0, "event-data --held-out-every is 0, but"),
         ({"data__supervision": "frames"}, 1, "--held-out-every 1 .*11 frames"),
         ({"data__supervision": "events+frames"}, 22, "--held-out-every 22 .*11 frames"),
-        ({"sensor__contrast_thresholds": (0.2, 0.0)}, 4, "--contrast-thresholds"),
+        ({"sensor__contrast_thresholds": (0.2, 0.0)}, 4, "--pipeline.model.contrast-thresholds is 0.2 0, but"),
     ],
 )
 def test_flags_that_cannot_be_followed(
@@ -188,6 +188,6 @@ def test_a_picture_of_grey_is_no_colour():
 def test_a_depth_range_that_is_none_is_refused_before_anything_is_written(recording: Path, tmp_path: Path, depth):
     config = small_config(recording, tmp_path / "outputs")
     config.pipeline.datamanager.dataparser.depth_range = depth
-    with pytest.raises(SystemExit, match="depth range is"):
+    with pytest.raises(SystemExit, match="event-data --depth-range is"):
         config.save_config()
     assert not (tmp_path / "outputs").exists()

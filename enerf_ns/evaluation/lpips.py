@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,11 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from enerf_ns.evaluation.metrics import NOT_FINITE, Score
+
 if TYPE_CHECKING:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 WEIGHTS_VARIABLE = "ENERF_LPIPS_WEIGHTS"
 """Environment variable that names a file with the state dict of torchvision's `alexnet().features` (ImageNet)."""
+
+SMALLEST_SIDE = 31
+"""Pixels along a side of the smallest picture of which AlexNet's poolings leave anything."""
 
 
 @functools.lru_cache(maxsize=1)
@@ -69,13 +73,15 @@ def _alexnet_at_hand(features: Path) -> Iterator[None]:
             torch.hub.set_dir(hub)
 
 
-def lpips(rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"]) -> float | None:
-    """Perceptual distance of two pictures in [0, 1]; None where the weights are missing."""
+def lpips(rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"]) -> Score:
+    """Perceptual distance of two pictures in [0, 1]."""
+    if not rendered.isfinite().all():
+        return NOT_FINITE
+    if min(rendered.shape[:2]) < SMALLEST_SIDE:
+        return f"the frame is smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE} pixels"
     metric = load_lpips()
     if metric is None:
-        return None
-    if rendered.isnan().any():
-        return math.nan
+        return "its weights could not be loaded"
     pictures = [image.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for image in (rendered, recorded)]
     with torch.no_grad():
         distance = float(metric(*pictures))

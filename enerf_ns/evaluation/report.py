@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 from enerf_ns.evaluation.runs import Run
-from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.scores import NotScored, summary_scores
 from enerf_ns.evaluation.views import HeldOutView, held_out_views
 
 if TYPE_CHECKING:
@@ -36,7 +37,9 @@ KEY_POSES = 7
 VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 
 
-def write_report(run: Run, output_dir: Path, extra: Mapping[str, float] | None = None) -> dict[str, float | None]:
+def write_report(
+    run: Run, output_dir: Path, extra: Mapping[str, float] | None = None
+) -> dict[str, float | None | NotScored]:
     """Render the held-out frames once and write scores.json and side-by-side.png; then camera_path.json and video.mp4.
 
     Args:
@@ -61,7 +64,7 @@ def write_report(run: Run, output_dir: Path, extra: Mapping[str, float] | None =
         write_whole(output_dir / "side-by-side.png", picture.getvalue())
         write_whole(output_dir / "scores.json", json.dumps(scores, indent=2) + "\n")
         write_whole(output_dir / "camera_path.json", json.dumps(camera_path(dataset.cameras)))
-    render_video(run, output_dir / "camera_path.json", output_dir / "video.mp4")
+        render_video(run, output_dir / "camera_path.json", output_dir / "video.mp4")
     return scores
 
 
@@ -89,12 +92,13 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
     height, width = chosen[0].depth.shape[:2]
     figure = Figure(figsize=(13, 0.3 + 2.95 * len(chosen) * height / width), layout="constrained", dpi=100)
     axes = figure.subplots(len(chosen), len(titles), squeeze=False)
-    near = min(float(view.depth.quantile(0.01)) for view in chosen)
-    far = max(float(view.depth.quantile(0.99)) for view in chosen)
+    depths = [depth for view in chosen if len(depth := view.depth[view.depth.isfinite()])]
+    near = min((float(depth.quantile(0.01)) for depth in depths), default=0.0)
+    far = max((float(depth.quantile(0.99)) for depth in depths), default=1.0)
     for row, view in zip(axes, chosen, strict=True):
         if view.recorded is not None:
             row[0].imshow(view.recorded.clamp(0, 1).numpy())
-        row[1].imshow(view.rendered.clamp(0, 1).numpy())
+        row[1].imshow(view.rendered.nan_to_num().clamp(0, 1).numpy())
         depth = row[2].imshow(view.depth[..., 0].numpy(), cmap="turbo", vmin=near, vmax=far)
         if recording.held_out_frames is None:
             row[3].imshow(event_picture(index_events(recording), recording.camera, view.time))
@@ -145,18 +149,31 @@ def render_video(run: Run, camera_path_file: Path, output: Path) -> None:
     Args:
         run: A trained run.
         camera_path_file: JSON of a `camera_path`.
-        output: The .mp4 file.
+        output: The .mp4 file, which is whole afterwards, or as it was before.
+
+    Raises:
+        OSError: It cannot be written.
+        OutputError: The same, where it is ffmpeg that finds out.
     """
     from nerfstudio.scripts.render import RenderCameraPath
 
     manager = run.pipeline.datamanager
     near, far = scene_depth_range(manager.eval_dataset.recording, manager.config.dataparser.depth_range)
     scale = manager.train_dataparser_outputs.dataparser_scale
-    RenderCameraPath(
-        load_config=run.config_file,
-        output_path=output,
-        rendered_output_names=["rgb", "depth"],
-        camera_path_filename=camera_path_file,
-        depth_near_plane=scale * near,
-        depth_far_plane=scale * far,
-    ).main()
+    partial = output.with_name(f".{output.stem}.partial-{os.getpid()}{output.suffix}")
+    try:
+        RenderCameraPath(
+            load_config=run.config_file,
+            output_path=partial,
+            rendered_output_names=["rgb", "depth"],
+            camera_path_filename=camera_path_file,
+            depth_near_plane=scale * near,
+            depth_far_plane=scale * far,
+        ).main()
+        partial.replace(output)
+    except RuntimeError as error:
+        if not str(error).startswith("Error writing"):  # as mediapy says
+            raise
+        raise OutputError(f"{output} could not be written as a video; make room on the disk.") from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,9 +16,11 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
+from enerf_ns.dataparsers.errors import OutputError
+from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_datamanager import EnerfDataManager
 from enerf_ns.enerf_model import EnerfModel
-from enerf_ns.evaluation.metrics import align_brightness, align_channels
+from enerf_ns.evaluation.metrics import Score, align_brightness, align_channels, fit_fault
 
 
 class RenderingPipeline(Protocol):
@@ -31,7 +34,7 @@ class RenderingPipeline(Protocol):
     @property
     def device(self) -> Any: ...
 
-    def event_correlation(self) -> float: ...
+    def event_correlation(self) -> Score: ...
 
     def eval(self) -> Any: ...
 
@@ -54,10 +57,12 @@ class HeldOutView:
     """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
     time: int
     """Instant of the view, ns."""
+    not_aligned: str | None = None
+    """Why the brightness of the render, which should be aligned, is not; None where it is, or need not be."""
 
 
 @torch.no_grad()
-def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict[str, float]]:
+def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict[str, Score]]:
     """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
 
     Args:
@@ -66,7 +71,7 @@ def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict
     Returns:
         The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
         each channel where the sensor has a colour filter; for a recording without frames, the correlation of its
-        events.
+        events, or why there is none.
     """
     pipeline.eval()
     manager = pipeline.datamanager
@@ -90,7 +95,7 @@ def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict
             )
         )
     seconds = time.perf_counter() - start
-    summary = {
+    summary: dict[str, Score] = {
         "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
         "fps": len(views) / seconds,
     }
@@ -103,17 +108,23 @@ def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict
 
 
 def _align(views: Sequence[HeldOutView], each_channel: bool) -> dict[str, float]:
-    """Fits the brightness of all renders at once, in place, and returns scale and offset."""
-    recorded = [view.recorded for view in views if view.recorded is not None]
-    rendered = [view.rendered for view in views]
+    """Fits the brightness of all finite renders at once, in place, and returns scale and offset."""
+    finite = [view for view in views if view.rendered.isfinite().all()]
+    if not finite:
+        return {}
+    recorded = [view.recorded for view in finite if view.recorded is not None]
+    rendered = [view.rendered for view in finite]
     if each_channel:
         aligned, channel_fits = align_channels(rendered, recorded)
         fits = dict(zip(("_red", "_green", "_blue"), channel_fits, strict=True))
     else:
         aligned, fit = align_brightness(rendered, recorded)
         fits = {"": fit}
-    for view, image in zip(views, aligned, strict=True):
-        view.rendered = image
+    fault = fit_fault(list(fits.values()))
+    for view, image in zip(finite, aligned, strict=True):
+        view.not_aligned = fault
+        if fault is None:
+            view.rendered = image
     summary = {}
     for name, (scale, offset) in fits.items():
         summary |= {f"brightness_scale{name}": scale, f"brightness_offset{name}": offset}
@@ -126,9 +137,18 @@ def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
     Args:
         views: In the order of their numbers.
         folder: Made if it does not exist.
+
+    Raises:
+        OutputError: The folder cannot be written to, or the disk is full.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(views):
         shown = [view.rendered] if view.recorded is None else [view.recorded, view.rendered]
-        picture = torch.cat(shown, dim=1).clamp(0.0, 1.0)
-        Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(folder / f"eval_img_{index:04d}.png")
+        picture = torch.cat(shown, dim=1).nan_to_num().clamp(0.0, 1.0)
+        content = io.BytesIO()
+        Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(content, format="png")
+        try:
+            write_whole(folder / f"eval_img_{index:04d}.png", content.getvalue())
+        except OSError as error:
+            raise OutputError(
+                f"The folder of pictures {folder} could not be written to ({error.strerror}); give another one."
+            ) from error

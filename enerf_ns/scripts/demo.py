@@ -10,6 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.report import write_report
 from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.ranges import check_ranges
 from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -26,15 +27,15 @@ class Demo:
     def main(self) -> None:
         output_dir = self.output_dir.expanduser().resolve()
         recording = output_dir / "recording"
-        if recording.exists():
-            CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.", markup=False)
-        else:
-            Simulate(recording, SimulationSettings("shapes")).main()
-
         config = method_config("enerf", recording, output_dir / "runs")
         config.steps_per_eval_image = config.steps_per_eval_batch
         if self.max_num_iterations is not None:
             config.max_num_iterations = self.max_num_iterations
+        check_ranges(config)
+        if recording.exists():
+            CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.", markup=False)
+        else:
+            Simulate(recording, SimulationSettings("shapes")).main()
         run = train(config)
         assert run.train_seconds is not None
         events = len(index_events(run.pipeline.datamanager.train_dataset.recording))

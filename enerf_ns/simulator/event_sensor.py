@@ -34,7 +34,7 @@ from jaxtyping import Float, Int64
 
 from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, Events
 from enerf_ns.sensor.response import LINEAR_UNTIL, Logarithm, response_named
 
 READOUT_QUEUE = 1000
@@ -51,10 +51,6 @@ TOLERANCE = 1e-9
 
 KNEE = math.log(LINEAR_UNTIL)
 """Log brightness up to which linlog is linear."""
-
-LEAST_THRESHOLD = 0.001
-"""Least contrast threshold, change of log brightness; sensors have more than ten times as much, and below it events
-beyond number would follow."""
 
 NEVER = 2**62
 """Time (ns) of what never happens."""
@@ -99,8 +95,9 @@ class SensorSettings:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "contrast_thresholds":
-                fine = len(value) == 2 and all(LEAST_THRESHOLD <= c < math.inf for c in value)
-                expected = f"two numbers of at least {LEAST_THRESHOLD}"
+                least, largest = CONTRAST_THRESHOLD_LIMITS
+                fine = len(value) == 2 and all(least <= threshold <= largest for threshold in value)
+                expected = f"two numbers from {least:g} to {largest:g}"
             elif field.name == "response":
                 try:
                     response_named(value)
@@ -112,7 +109,7 @@ class SensorSettings:
             else:
                 fine, expected = 0 <= value <= 1e15, "at least 0 and at most 1e15"
             if not fine:
-                raise FlagError(f"{field.name} is {value}, but must be {expected}.")
+                raise FlagError(f"--{field.name.replace('_', '-')} is {value}, but must be {expected}.")
 
 
 class PartialPicture(NamedTuple):
@@ -181,11 +178,11 @@ class EventSensor:
         threshold_rng, hot_rng = np.random.default_rng(drawn).spawn(2)
         spread = 1 + settings.threshold_spread * threshold_rng.standard_normal((2, *brightness.shape))
         self.contrast_thresholds = spread * np.array(settings.contrast_thresholds)[:, None, None]
-        without = np.count_nonzero((self.contrast_thresholds < LEAST_THRESHOLD).any(0))
+        without = np.count_nonzero((self.contrast_thresholds < CONTRAST_THRESHOLD_LIMITS[0]).any(0))
         if without:
             raise FlagError(
-                f"threshold_spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
-                f"threshold of {LEAST_THRESHOLD} or more; give a smaller one."
+                f"--threshold-spread is {settings.threshold_spread}, which leaves {without} of {size} pixels without a "
+                f"threshold of {CONTRAST_THRESHOLD_LIMITS[0]} or more; give a smaller one."
             )
         self.hot_pixels = np.sort(hot_rng.choice(size, round(settings.hot_pixels * size), replace=False))
         self._keys = drawn.generate_state(4, np.uint64)

@@ -31,14 +31,13 @@ class FrameSettings:
     """Keep the linear brightness of frames as well, without noise and saturation."""
 
     def __post_init__(self) -> None:
-        for name, fine, expected in (
-            ("saturation", 1e-9 <= self.saturation < np.inf, "a brightness above 0"),
-            ("read noise", 0 <= self.read_noise < np.inf, "grey levels from 0 on"),
-            ("shot noise", 0 <= self.shot_noise <= 1e9, "electrons from 0 to 1e9"),
+        for name, value, least, what in (
+            ("saturation", self.saturation, 1e-9, "a brightness"),
+            ("read-noise", self.read_noise, 0.0, "grey levels"),
+            ("shot-noise", self.shot_noise, 0.0, "electrons"),
         ):
-            if not fine:
-                value = getattr(self, name.replace(" ", "_"))
-                raise FlagError(f"The {name} of frames is {value:g}, but {expected} was expected.")
+            if not least <= value <= 1e9:
+                raise FlagError(f"--frame.{name} is {value:g}, but must be {what} from {least:g} to 1e9.")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads these annotations on Python 3.10
 
-import numpy as np
 import tyro
 
 from enerf_ns.dataparsers.errors import FlagError
@@ -135,13 +134,14 @@ def resolve(settings: SimulationSettings) -> SimulationSettings:
 def _check_ranges(settings: SimulationSettings) -> None:
     for name, fine, expected in (
         ("duration", lambda v: 1e-3 <= v <= 1000, "seconds from 0.001 to 1000"),
-        ("num_frames", lambda v: v > 0, "at least 1"),
-        ("exposure_ms", lambda v: 0 <= v < np.inf, "milliseconds from 0 on"),
+        ("num_frames", lambda v: 0 < v <= 10**9, "at least 1 and at most 10^9"),
+        ("exposure_ms", lambda v: 0 <= v <= 1e6, "milliseconds from 0 to 10^6"),
         ("width", lambda v: 0 < v < 2**15, "pixels above 0"),
         ("height", lambda v: 0 < v < 2**15, "pixels above 0"),
         ("field_of_view", lambda v: 0 < v < 180, "degrees between 0 and 180"),
-        ("max_displacement", lambda v: 0 < v < np.inf, "pixels above 0"),
-        ("max_change", lambda v: 0 < v < np.inf, "a change of log brightness above 0"),
+        ("frames_per_second", lambda v: 1e-3 <= v <= 1e6, "from 0.001 to 1000000"),
+        ("max_displacement", lambda v: 0 < v <= 1e6, "pixels above 0, and at most 10^6"),
+        ("max_change", lambda v: 0 < v <= 1e6, "a change of log brightness above 0, and at most 10^6"),
         ("bayer_pattern", lambda v: len(v) == 4 and set(v) <= set("RGB"), "four letters of R, G and B"),
     ):
         value = getattr(settings, name)

@@ -77,7 +77,7 @@ def test_stretches_are_what_the_gaps_leave_of_the_span(time_range: tuple[float, 
     ("stated", "message"),
     [
         (dict(contrast_thresholds=(0.2, 0.0)), r"contrast thresholds 0\.2 \(of on events\) and 0"),
-        (dict(contrast_thresholds=(float("nan"), 0.2)), "both must be above 0"),
+        (dict(contrast_thresholds=(float("nan"), 0.2)), "both must be from 0.001 to 10"),
         (dict(refractory_period=-1), "refractory period -1 ns"),
         (dict(refractory_period=10**13), "refractory period 1e.13 ns"),
         (dict(bayer_pattern="RGB"), "Bayer pattern 'RGB'"),

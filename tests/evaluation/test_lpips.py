@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import torch
 import torchmetrics
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from enerf_ns.evaluation.lpips import WEIGHTS_VARIABLE, load_lpips, lpips
+from enerf_ns.evaluation.lpips import SMALLEST_SIDE, WEIGHTS_VARIABLE, load_lpips, lpips
 
 
 @pytest.fixture(autouse=True)
@@ -85,9 +84,21 @@ def test_distances_do_not_depend_on_those_before(weights):
     assert lpips(noisy(IMAGE, 0.1), IMAGE) == first
 
 
-def test_a_render_that_is_no_number_has_none(weights):
-    assert math.isnan(lpips(IMAGE * torch.nan, IMAGE))  # type: ignore[arg-type]
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_render_that_is_not_finite_has_no_distance(weights, value: float):
+    rendered = IMAGE.clone()
+    rendered[3, 4, 1] = value
+    assert lpips(rendered, IMAGE) == "the render is not finite"
     assert lpips(IMAGE + 1e-6, IMAGE + 1e-6) == 0.0, "a rounding error beyond 1 is none"
+
+
+def test_pictures_have_a_distance_from_the_size_on_that_alexnet_takes(weights):
+    small = IMAGE[:SMALLEST_SIDE, :SMALLEST_SIDE]
+    assert isinstance(lpips(noisy(small, 0.1), small), float)
+    for smaller in (small[:-1], small[:, :-1]):
+        assert lpips(smaller, smaller) == "the frame is smaller than 31 x 31 pixels"
+        with pytest.raises(RuntimeError, match="too small"):
+            load_lpips()(*[smaller.movedim(-1, 0)[None]] * 2)  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no weights"])
@@ -98,7 +109,7 @@ def test_without_weights_there_is_no_distance_and_one_line_says_why(
     if content is not None:
         path.write_bytes(content)
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(path))
-    assert [lpips(IMAGE, IMAGE), lpips(IMAGE, IMAGE)] == [None, None]
+    assert [lpips(IMAGE, IMAGE), lpips(IMAGE, IMAGE)] == ["its weights could not be loaded"] * 2
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1 and WEIGHTS_VARIABLE in lines[0]
 
@@ -106,4 +117,4 @@ def test_without_weights_there_is_no_distance_and_one_line_says_why(
 def test_weights_that_do_not_fit_are_no_distance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     torch.save({"0.weight": torch.zeros(3)}, tmp_path / "weights.pth")
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights.pth"))
-    assert lpips(IMAGE, IMAGE) is None
+    assert lpips(IMAGE, IMAGE) == "its weights could not be loaded"

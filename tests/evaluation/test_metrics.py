@@ -8,7 +8,14 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-from enerf_ns.evaluation.metrics import align_brightness, align_channels, correlation, depth_rmse, image_metrics
+from enerf_ns.evaluation.metrics import (
+    align_brightness,
+    align_channels,
+    correlation,
+    depth_rmse,
+    fit_fault,
+    image_metrics,
+)
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 
@@ -79,12 +86,48 @@ def test_constant_renders_align_to_the_mean_of_the_recorded():
     torch.testing.assert_close(aligned[1], torch.full((12, 16, 3), inverse_linlog(mean).item()))
 
 
+def test_a_negative_and_flat_pictures_are_no_fit_and_a_picture_is_one():
+    recorded = pictures(2)
+    negative = [inverse_linlog(7.0 - 0.61 * linlog(image)) for image in recorded]
+    flat = [torch.full((12, 16, 3), 0.1)] * 2
+    good, bad = (align_brightness(rendered, recorded)[1] for rendered in (recorded, negative))
+    assert bad[0] == pytest.approx(-1 / 0.61)
+    assert fit_fault([good]) is None
+    assert str(fit_fault([bad])).startswith("the render is a negative of the frame (brightness scale -1.64); check the")
+    assert fit_fault([good, bad]) == fit_fault([bad])
+    for pair in ((flat, recorded), (recorded, flat), (flat, flat)):
+        fit = align_brightness(*pair)[1]
+        assert fit[0] == 0.0
+        assert str(fit_fault([fit])).startswith("no brightness scale fits, since what is rendered or recorded is flat")
+    red_negative = [torch.cat([a[..., :1], b[..., 1:]], -1) for a, b in zip(negative, recorded, strict=True)]
+    assert "negative" in str(fit_fault(align_channels(red_negative, recorded)[1]))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_render_with_a_pixel_that_is_not_finite_has_no_score(value: float):
+    rendered, recorded = pictures(1)[0], pictures(1, seed=1)[0]
+    rendered[3, 4, 1] = value
+    assert image_metrics(rendered, recorded) == dict.fromkeys(("psnr", "ssim"), "the render is not finite")
+    assert correlation(rendered, recorded) == "the render is not finite"
+
+
+def test_pictures_smaller_than_the_window_of_ssim_have_a_psnr():
+    smallest, recorded = (picture[:11, :11] for picture in (pictures(1)[0], pictures(1, seed=1)[0]))
+    assert all(isinstance(score, float) and np.isfinite(score) for score in image_metrics(smallest, recorded).values())
+    for cut in (slice(10), (slice(None), slice(10))):
+        scores = image_metrics(smallest[cut], recorded[cut])
+        assert scores["ssim"] == "the frame is smaller than 11 x 11 pixels"
+        expected = peak_signal_noise_ratio(recorded[cut].numpy(), smallest[cut].numpy(), data_range=1.0)
+        assert scores["psnr"] == pytest.approx(expected, abs=1e-9)
+
+
 @pytest.mark.parametrize("values", [(0.4, 0.4), (0.4, 0.6), (0.0, 1.0)])
-def test_scores_of_constant_pictures_are_numbers(values: tuple[float, float]):
+def test_constant_pictures_have_scores_but_no_correlation(values: tuple[float, float]):
     constant = [torch.full((12, 16, 3), value) for value in values]
     scores = image_metrics(*constant)
-    assert all(np.isfinite(score) for score in scores.values())
-    assert correlation(*constant) == 0.0
+    assert isinstance(scores["ssim"], float) and np.isfinite(scores["ssim"])
+    assert correlation(*constant) == correlation(constant[0], pictures(1)[0]) == "what is rendered is flat"
+    assert correlation(pictures(1)[0], constant[1]) == "what is recorded is flat"
     assert scores["psnr"] == pytest.approx(120.0 if values[0] == values[1] else -20 * np.log10(values[1] - values[0]))
 
 
@@ -110,3 +153,11 @@ def test_depth_error_leaves_out_what_is_unknown():
     rendered = torch.tensor([[1.0, 2.0], [3.0, 100.0]])[..., None]
     recorded = torch.tensor([[2.0, 2.0], [5.0, 0.0]])[..., None]
     assert depth_rmse(rendered, recorded) == pytest.approx(np.sqrt((1 + 0 + 4) / 3))
+    for unknown in (torch.nan, torch.inf, -1.0):
+        recorded[1, 1] = unknown
+        assert depth_rmse(rendered, recorded) == pytest.approx(np.sqrt((1 + 0 + 4) / 3))
+    rendered[1, 1] = torch.nan
+    assert depth_rmse(rendered, recorded) == pytest.approx(np.sqrt((1 + 0 + 4) / 3))
+    rendered[0, 0] = torch.nan
+    assert depth_rmse(rendered, recorded) == "the rendered depth is not finite"
+    assert depth_rmse(rendered, torch.zeros_like(recorded)) == "no depth is known"

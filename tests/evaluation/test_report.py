@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -115,13 +116,88 @@ def test_depth_is_coloured_from_the_nearest_to_the_farthest(run: Run, tmp_path: 
             asked.update(settings)
 
         def main(self) -> None:
-            asked["called"] = True
+            asked["output_path"].write_text("video")
 
     monkeypatch.setattr(render, "RenderCameraPath", Renderer)
     render_video(run, tmp_path / "path.json", tmp_path / "video.mp4")
     near, far = run.pipeline.datamanager.eval_dataset.recording.depth_range  # type: ignore[misc]
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
-    assert asked["called"] and asked["load_config"] == run.config_file
-    assert asked["output_path"] == tmp_path / "video.mp4"
+    assert asked["load_config"] == run.config_file and asked["camera_path_filename"] == tmp_path / "path.json"
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("video.mp4", "video")]
     assert asked["depth_near_plane"] == pytest.approx(run.pipeline.config.model.near_plane)
     assert asked["depth_far_plane"] == pytest.approx(far * scale) and asked["depth_near_plane"] == near * scale
+
+
+@pytest.mark.parametrize(
+    "failure", [OSError(errno.ENOSPC, "No space left on device"), SystemExit(1), RuntimeError("x")]
+)
+def test_a_video_that_breaks_off_leaves_the_one_of_before(
+    run: Run, tmp_path: Path, monkeypatch, failure: BaseException
+):
+    class Renderer:
+        def __init__(self, output_path: Path, **settings: Any):
+            self.output_path = output_path
+
+        def main(self) -> None:
+            self.output_path.write_text("half")
+            raise failure
+
+    (tmp_path / "video.mp4").write_text("before")
+    monkeypatch.setattr(render, "RenderCameraPath", Renderer)
+    with pytest.raises(type(failure)):
+        render_video(run, tmp_path / "path.json", tmp_path / "video.mp4")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("video.mp4", "before")]
+
+
+@pytest.mark.parametrize(
+    ("output", "change"),
+    [
+        ("rgb", lambda rgb: 1.0 - rgb),
+        ("rgb", lambda rgb: rgb * 0.0),
+        ("rgb", lambda rgb: rgb * torch.nan),
+        ("rgb", lambda rgb: rgb + torch.inf),
+        ("depth", lambda depth: depth * torch.nan),
+        ("depth", lambda depth: depth * 0.0),
+    ],
+    ids=["negative", "dark", "nan", "inf", "nan depth", "no depth"],
+)
+@pytest.mark.parametrize("every", [1, 2])
+def test_whatever_a_field_shows_the_report_is_whole_and_json(
+    run: Run, tmp_path: Path, monkeypatch, no_video: None, output: str, change: Any, every: int
+):
+    """Of all frames or of every second: every mean that is missing has its reason, and the picture is drawn."""
+    model = run.pipeline.model
+    rendered, calls = model.get_outputs_for_camera_ray_bundle, []
+
+    def outputs(rays: Any) -> dict[str, torch.Tensor]:
+        calls.append(rays)
+        made = rendered(rays)
+        return made | ({output: change(made[output])} if len(calls) % every == 0 else {})
+
+    monkeypatch.setattr(model, "get_outputs_for_camera_ray_bundle", outputs)
+    table = write_report(run, tmp_path)
+    text = (tmp_path / "scores.json").read_text()
+    assert json.loads(text, parse_constant=lambda name: pytest.fail(name)) == table
+    reasons: Any = table["not_scored"]
+    for name in ("psnr", "ssim", "lpips", "correlation", "depth_rmse"):
+        left_out = sorted(number for numbers in reasons.get(name, {}).values() for number in numbers)
+        assert (table.get(name) is None) == (left_out == [0, 1, 2])
+        assert len(set(left_out)) == len(left_out)
+    assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
+
+
+@pytest.mark.slow
+def test_a_disk_too_small_for_the_video_is_one_sentence(run: Run, tmp_path: Path):
+    """By a limit of the size of files, which ffmpeg inherits."""
+    (tmp_path / "video.mp4").write_text("before")
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(camera_path(run.pipeline.datamanager.eval_dataset.cameras)))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises((OutputError, OSError)):
+            render_video(run, path, tmp_path / "video.mp4")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / "video.mp4").read_text() == "before"
+    assert {file.name for file in tmp_path.iterdir()} == {"video.mp4", "path.json"}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,10 @@ import pytest
 import torch
 from PIL import Image
 
+from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.evaluation.metrics import align_brightness
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.views import HeldOutView, held_out_views, save_pictures
 from enerf_ns.sensor.response import inverse_linlog, linlog
@@ -21,14 +24,14 @@ HELD_OUT = [2, 6, 10]
 
 @pytest.fixture
 def shown(run: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A pipeline whose field shows a wall parallel to every picture, brighter to the right and from view to view."""
+    """A pipeline whose field shows a wall parallel to every picture, darker to the right and brighter from view to view."""
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     calls = []
 
     def outputs(rays: Any) -> dict[str, torch.Tensor]:
         height, width = rays.shape
         calls.append(rays)
-        brightness = torch.linspace(0.1, 0.5, width).expand(height, width)[..., None] + 0.1 * len(calls)
+        brightness = torch.linspace(0.5, 0.1, width).expand(height, width)[..., None] + 0.1 * len(calls)
         return {
             "rgb": brightness.expand(-1, -1, 3),
             "depth": scale * METRES * rays.metadata["directions_norm"],
@@ -72,6 +75,50 @@ def test_brightness_is_fitted_once_over_all_views(shown: Any):
         torch.testing.assert_close(view.rendered, expected, rtol=0, atol=1e-6)
 
 
+def test_one_render_that_is_not_finite_leaves_the_fit_of_the_others_as_it_would_be_without(
+    shown: Any, monkeypatch: pytest.MonkeyPatch
+):
+    without = [view for i, view in enumerate(held_out_views(shown)[0]) if i != 1]
+    recorded = [view.recorded for view in without if view.recorded is not None]
+    aligned, (scale, offset) = align_brightness([view.unaligned for view in without], recorded)
+    sound = shown.model.get_outputs_for_camera_ray_bundle
+    calls = []
+
+    def outputs(rays: Any) -> dict[str, torch.Tensor]:
+        calls.append(rays)
+        made = sound(rays)
+        made["rgb"] = made["rgb"] - 0.3  # as of the first three calls
+        if len(calls) == 2:
+            made["rgb"][5, 6] = torch.nan
+        return made
+
+    monkeypatch.setattr(shown.model, "get_outputs_for_camera_ray_bundle", outputs)
+    views, summary = held_out_views(shown)
+    assert summary["brightness_scale"] == pytest.approx(scale) and summary["brightness_offset"] == pytest.approx(offset)
+    for view, expected in zip((views[0], views[2]), aligned, strict=True):
+        torch.testing.assert_close(view.rendered, expected, rtol=0, atol=1e-6)
+    assert views[1].rendered.isnan().sum() == 3 and all(view.not_aligned is None for view in views)
+
+
+def test_a_negative_and_what_is_flat_is_shown_as_it_is_and_why(shown: Any, monkeypatch: pytest.MonkeyPatch):
+    sound = shown.model.get_outputs_for_camera_ray_bundle
+    for change, reason in (
+        (lambda rgb: 1.2 - rgb, "the render is a negative of the frame (brightness scale -"),
+        (lambda rgb: 0.0 * rgb, "no brightness scale fits"),
+    ):
+
+        def outputs(rays: Any, change: Any = change) -> dict[str, torch.Tensor]:
+            made = sound(rays)
+            return made | {"rgb": change(made["rgb"])}
+
+        monkeypatch.setattr(shown.model, "get_outputs_for_camera_ray_bundle", outputs)
+        views, summary = held_out_views(shown)
+        assert isinstance(summary["brightness_scale"], float) and summary["brightness_scale"] <= 0
+        for view in views:
+            assert view.not_aligned is not None and view.not_aligned.startswith(reason)
+            torch.testing.assert_close(view.rendered, view.unaligned, rtol=0, atol=0)
+
+
 def test_brightness_that_frames_fix_is_left_as_it_is(shown: Any, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shown.datamanager.config, "supervision", "frames")
     views, summary = held_out_views(shown)
@@ -102,3 +149,23 @@ def test_pictures_show_the_frame_beside_the_render(tmp_path: Path):
     np.testing.assert_array_equal(pictures[0][:, 5:], np.rint(255 * (2 * rendered.numpy() - 0.5).clip(0, 1)))
     np.testing.assert_array_equal(pictures[1], np.rint(255 * rendered.numpy()))
     assert (tmp_path / "new" / "pictures" / "eval_img_0001.png").is_file()
+
+
+def test_a_full_disk_leaves_no_half_of_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(path: Path, content: bytes) -> int:
+        with open(path, "wb") as file:
+            file.write(content[:10])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    picture = torch.full((4, 5, 3), torch.nan)
+    view = HeldOutView(None, picture, picture, torch.ones(4, 5, 1), None, 0)
+    save_pictures([view], tmp_path)
+    assert not np.asarray(Image.open(tmp_path / "eval_img_0000.png")).any(), "what is not finite is black"
+    before = (tmp_path / "eval_img_0000.png").read_bytes()
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(
+        OutputError, match=r"^The folder of pictures .* \(No space left on device\); give another one\.$"
+    ):
+        save_pictures([view, view], tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["eval_img_0000.png"]
+    assert (tmp_path / "eval_img_0000.png").read_bytes() == before

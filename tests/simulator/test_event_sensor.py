@@ -378,7 +378,7 @@ def test_every_pixel_counts_by_its_own_threshold():
 
 def test_a_spread_that_leaves_pixels_without_a_threshold_is_refused():
     settings = SensorSettings(threshold_spread=0.5, seed=7)
-    with pytest.raises(FlagError, match=r"^threshold_spread is 0.5, which leaves (\d+) of 1200 pixels") as caught:
+    with pytest.raises(FlagError, match=r"^--threshold-spread is 0.5, which leaves (\d+) of 1200 pixels") as caught:
         EventSensor(settings, np.ones((30, 40)), 0)
     share = int(str(caught.value).split("leaves ")[1].split(" ")[0]) / 1200
     assert share == pytest.approx(1 - (1 - 0.02275) ** 2, rel=0.4)  # beyond two standard deviations, on or off
@@ -771,7 +771,7 @@ def loop(
 )
 def test_settings_that_no_sensor_has_are_refused(wrong):
     (name,) = wrong
-    with pytest.raises(FlagError, match=f"^{name} is .*, but must be .*\\.$"):
+    with pytest.raises(FlagError, match=f"^--{name.replace('_', '-')} is .*, but must be .*\\.$"):
         SensorSettings(**wrong)
 
 

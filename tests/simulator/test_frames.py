@@ -159,10 +159,10 @@ def test_noise_is_of_the_seed_the_frame_and_whether_it_is_blurred():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (dict(saturation=0.0), "saturation of frames is 0, but a brightness above 0"),
-        (dict(saturation=float("nan")), "saturation of frames is nan"),
-        (dict(read_noise=-1.0), "read noise of frames is -1, but grey levels from 0 on"),
-        (dict(shot_noise=float("inf")), "shot noise of frames is inf, but electrons from 0 to 1e9"),
+        (dict(saturation=0.0), "^--frame.saturation is 0, but must be a brightness from 1e-09 to 1e9.$"),
+        (dict(saturation=float("nan")), "^--frame.saturation is nan"),
+        (dict(read_noise=-1.0), "^--frame.read-noise is -1, but must be grey levels from 0 to 1e9.$"),
+        (dict(shot_noise=float("inf")), "^--frame.shot-noise is inf, but must be electrons from 0 to 1e9.$"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict, message: str):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 
 from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.simulator.event_sensor import SensorSettings
+from enerf_ns.simulator.frames import FrameSettings
 from enerf_ns.simulator.settings import SimulationSettings, resolve
 
 
@@ -43,3 +47,26 @@ def test_what_is_resolved_stays_as_it_is():
 def test_pictures_have_no_poses_for_other_layouts():
     with pytest.raises(FlagError, match=r"^clip\.mp4 has pictures and no poses, which --layout esim needs; give"):
         resolve(SimulationSettings("clip.mp4", layout="esim"))
+
+
+NUMBERS = {
+    (kind, field.name): "tuple" in str(hint)
+    for kind in (SimulationSettings, SensorSettings, FrameSettings)
+    for field in fields(kind)
+    if any(number in str(hint := get_type_hints(kind)[field.name]) for number in ("int", "float"))
+}
+"""Every setting that is a number, and whether it is several."""
+
+
+def test_all_numbers_are_found():
+    assert len(NUMBERS) > 20 and {"duration", "seed", "saturation"} <= {name for _, name in NUMBERS}
+
+
+@pytest.mark.parametrize(("kind", "name"), NUMBERS)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1, 1e300])
+def test_numbers_that_no_setting_takes_are_refused_by_flag(kind: type, name: str, value: float):
+    changes: Any = {name: (0.2, value) if NUMBERS[kind, name] else value}
+    part = {SensorSettings: "sensor", FrameSettings: "frame"}.get(kind)
+    flag = "--" + ("frame." if kind is FrameSettings else "") + name.replace("_", "-")
+    with pytest.raises(FlagError, match=rf"^{flag} is .*, but must be .*\.$"):
+        resolve(SimulationSettings("shapes", **({part: kind(**changes)} if part else changes)))
