@@ -1,11 +1,115 @@
-"""What loading a checkpoint needs."""
+"""Checkpoints that are whole or not there, what a run needs to go on as if it had not stopped, and what loading needs."""
 
 from __future__ import annotations
 
+import io
+import os
+import random
+import zipfile
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from enerf_ns.dataparsers.errors import RecordingError
+
+
+def checkpoint_path(folder: Path, step: int) -> Path:
+    """The checkpoint after a step, as Nerfstudio names it."""
+    return folder / f"step-{step:09d}.ckpt"
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest whole checkpoint of a folder; one that is not whole is passed over, which is said once.
+
+    Args:
+        folder: nerfstudio_models of a run, with whatever else lies in it.
+
+    Returns:
+        None where there is no such folder.
+
+    Raises:
+        RecordingError: The folder holds no checkpoint, or none that is whole.
+    """
+    if not folder.is_dir():
+        return None
+    for path in sorted(folder.glob("step-" + "[0-9]" * 9 + ".ckpt"), reverse=True):
+        if is_whole(path):
+            return path
+        _say_passed_over(path)
+    raise RecordingError(
+        f"{folder} holds no whole checkpoint; give another run, or remove this folder to train its run from the start."
+    )
+
+
+def is_whole(path: Path) -> bool:
+    """Whether all of a file that torch.save wrote is there as it was written, by the checksums in it."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except Exception:  # of any kind, depending on where the damage lies
+        return False
+
+
+@cache
+def _say_passed_over(path: Path) -> None:
+    CONSOLE.print(
+        f"{path} is cut short or damaged; the checkpoint before it is used.", soft_wrap=True, markup=False, style="yellow"
+    )
+
+
+def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Stores a checkpoint whole or not at all, also where the power fails.
+
+    The unfinished file lies above the folder of the checkpoint, since Nerfstudio reads a step from every name in it.
+
+    Args:
+        path: Its folder is made where it does not exist.
+        state: Tensors and plain Python values.
+
+    Raises:
+        OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+    """
+    content = io.BytesIO()
+    torch.save(state, content)
+    partial = path.parent.with_name(".checkpoint.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def random_state(device: torch.device) -> dict[str, Any]:
+    """The states of the generators that are the process's, as tensors and plain Python values.
+
+    Args:
+        device: Whose generator is stored too, where it is a CUDA device.
+    """
+    name, keys, *rest = np.random.get_state()  # noqa: NPY002 - libraries draw from it
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state(device) if device.type == "cuda" else None,
+        "numpy": (name, np.asarray(keys).tolist(), *rest),
+        "python": random.getstate(),
+    }
+
+
+def set_random_state(state: dict[str, Any], device: torch.device) -> None:
+    """Puts the generators of the process into the states that `random_state` gave."""
+    torch.set_rng_state(state["torch"])
+    if state["cuda"] is not None and device.type == "cuda":
+        torch.cuda.set_rng_state(state["cuda"], device)
+    np.random.set_state(state["numpy"])  # noqa: NPY002 - libraries draw from it
+    random.setstate(state["python"])
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:

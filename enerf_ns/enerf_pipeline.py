@@ -20,6 +20,7 @@ from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import Score, correlation
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views, save_pictures
+from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ffmpeg import make_ffmpeg_available
 from enerf_ns.supervision.event_supervision import brightness_change
 
@@ -55,11 +56,26 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
         self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), **state})
 
 
+@dataclass(frozen=True)
+class TrainStep:
+    """What one training step looked at, rendered and lost, without its graph."""
+
+    batch: TrainBatch
+    rgb: Tensor
+    """Rendered, shape (rays, 3), in the order of `TrainBatch.split`."""
+    accumulation: Tensor
+    """Share of each ray that surfaces stop, shape (rays, 1)."""
+    losses: dict[str, Tensor]
+    """Each term with its weight."""
+
+
 class EnerfPipeline(VanillaPipeline):
     """Scores held-out frames together, because events fix brightness only up to one scale and offset."""
 
     datamanager: EnerfDataManager
     config: EnerfPipelineConfig
+    last_step: TrainStep
+    """The last training step, once there was one."""
 
     @property
     def model(self) -> EnerfModel:
@@ -71,7 +87,10 @@ class EnerfPipeline(VanillaPipeline):
         batch = self.datamanager.next_batch(sensor)
         outputs = self._model(self.datamanager.rays(batch, sensor))
         metrics = self.model.get_metrics_dict(outputs, batch)
-        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+        losses = self.model.get_loss_dict(outputs, batch, metrics)
+        detached = {name: loss.detach() for name, loss in losses.items()}
+        self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
+        return outputs, losses, metrics
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch, as of `get_train_loss_dict` but rendered as in evaluation."""

@@ -1,22 +1,43 @@
-"""Training as a person sees it: what the recording holds at the start, where everything lies at the end."""
+"""Training as a person sees it: what the recording holds at the start, where everything lies at the end, and what
+becomes of a run that is interrupted, or whose steps go wrong."""
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
-from collections.abc import Sequence
+import signal
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import torch
+import yaml
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
+from torch import Tensor
+from torch.amp.grad_scaler import GradScaler
+from torch.nn import Parameter
 
+from enerf_ns.checkpoints import (
+    allow_numpy_scalars_in_checkpoints,
+    checkpoint_path,
+    is_whole,
+    newest_checkpoint,
+    random_state,
+    set_random_state,
+    write_checkpoint,
+)
 from enerf_ns.choices import Choice, resolve
-from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
-from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence
+from enerf_ns.dataparsers.files import write_together, write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
@@ -24,6 +45,19 @@ from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
+from enerf_ns.supervision.event_supervision import brightness_change
+
+MOST_SKIPPED = 5
+"""Steps in a row that may be skipped because they are not finite, before training stops."""
+
+LEARNING_CHECKED_EVERY, LEARNING_CHECKED_FROM = 100, 300
+"""Steps between looks at whether anything is learnt, and steps before the first."""
+
+NOTHING = 1e-3
+"""Share of the measured change of log brightness, or of a ray, below which a field renders nothing."""
+
+SAMPLER_COUNTERS = ("_step", "_steps_since_update")
+"""What Nerfstudio's proposal sampler remembers from step to step."""
 
 
 @dataclass
@@ -42,8 +76,9 @@ class EnerfTrainerConfig(TrainerConfig):
         recording (`pipeline.resolution`), whose events are read and checked.
 
         Raises:
-            RecordingError: The recording cannot be used.
+            RecordingError: The recording cannot be used, or the checkpoint to go on from.
             FlagError: A setting cannot be followed.
+            OutputError: The run's folder holds another run.
         """
         check_ranges(self)
         config = deepcopy(self)
@@ -53,8 +88,13 @@ class EnerfTrainerConfig(TrainerConfig):
             raise FlagError("--data is missing; give the folder of a recording")
         config.data = pipeline.datamanager.data = parser.data = data.expanduser().resolve()
         config.output_dir = self.output_dir.expanduser().resolve()
-        for group in config.optimizers.values():
-            group["scheduler"].max_steps = group["scheduler"].max_steps or self.max_num_iterations
+        config.load_dir = self.load_dir and self.load_dir.expanduser().resolve()
+        config.load_checkpoint = self.load_checkpoint and self.load_checkpoint.expanduser().resolve()
+        checkpoint = config.checkpoint()
+        decays = load(checkpoint).get("max_steps", {}) if checkpoint else {}
+        for name, group in config.optimizers.items():
+            scheduler = group["scheduler"]
+            scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
         if not pipeline.resolution.choices:
             recording = parser.setup().recording()
             optimizer, device = config.optimizers["fields"]["optimizer"], config.machine.device_type
@@ -68,35 +108,326 @@ class EnerfTrainerConfig(TrainerConfig):
         """The recording that is learnt from, of a config that is resolved."""
         return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
 
+    def checkpoint(self) -> Path | None:
+        """The checkpoint that training goes on from: the newest whole one of a run that config.yml was loaded of, else
+        what the flags name, else None.
+
+        Raises:
+            RecordingError: There are checkpoints, and none is whole.
+            FlagError: A checkpoint that a flag names is not there, or the run is to end before it.
+            OutputError: The run's folder holds a run already that neither config.yml nor a flag names.
+        """
+        folder = super().get_checkpoint_dir()
+        own = newest_checkpoint(folder)
+        if own and self.pipeline.resolution.choices:
+            return own
+        if own and self.load_dir != folder:
+            raise OutputError(
+                f"{folder.parent} holds a run already; continue it with --load-config {folder.parent / 'config.yml'}, "
+                "or give the new one another --timestamp."
+            )
+        if self.load_dir and self.load_step is None:
+            path = newest_checkpoint(self.load_dir)
+            if path is None:
+                raise FlagError(f"--load-dir {self.load_dir} does not exist; give nerfstudio_models of a trained run.")
+        elif self.load_dir or self.load_checkpoint:
+            path = checkpoint_path(self.load_dir, self.load_step or 0) if self.load_dir else self.load_checkpoint
+            assert path is not None
+            if not is_whole(path):
+                found = "is cut short or damaged" if path.exists() else "does not exist"
+                raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
+        else:
+            return None
+        step = load(path)["step"]
+        if step + 1 >= self.max_num_iterations:
+            raise FlagError(
+                f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give more "
+                "to train on."
+            )
+        return path
+
+    def get_checkpoint_dir(self) -> Path:
+        """The folder of the run's checkpoints; `load_step` becomes that of the newest whole one in it.
+
+        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they load
+        `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which they
+        can be told better.
+
+        Raises:
+            SystemExit: The folder is there, but no whole checkpoint in it; with one sentence.
+        """
+        folder = super().get_checkpoint_dir()
+        with exit_with_a_sentence():
+            newest = newest_checkpoint(folder)
+        if newest is not None:
+            self.load_step = int(newest.stem.removeprefix("step-"))
+        return folder
+
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""
         with exit_with_a_sentence():
             config = self.resolved()
             CONSOLE.print(recording_table(config))
-        resolution = config.pipeline.resolution
-        for line in resolution.selection:
-            CONSOLE.print(f"* {line}", highlight=False, markup=False)
-        CONSOLE.print(choices_table(resolution.choices))
-        super(EnerfTrainerConfig, config).save_config()
-        choices = [asdict(choice) for choice in resolution.choices]
-        write_whole(config.get_base_dir() / "choices.json", json.dumps(choices, indent=2))
+            resolution = config.pipeline.resolution
+            for line in resolution.selection:
+                CONSOLE.print(f"* {line}", highlight=False, markup=False)
+            CONSOLE.print(choices_table(resolution.choices))
+            folder = config.get_base_dir()
+            choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
+            try:
+                write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
+            except OSError as error:
+                raise OutputError(
+                    f"{folder} could not be written to ({error.strerror}); make room, or give another --output-dir."
+                ) from error
 
     def setup(self, **kwargs: Any) -> EnerfTrainer:
         """The trainer, of what this config comes to on its recording."""
         with exit_with_a_sentence():
-            return self._target(self.resolved(), **kwargs)
+            config = self.resolved()
+            config.load_checkpoint, config.load_dir = config.checkpoint(), None
+            return self._target(config, **kwargs)
+
+
+def load(checkpoint: Path) -> dict[str, Any]:
+    """What a checkpoint holds; of its tensors, only those that are used are read."""
+    allow_numpy_scalars_in_checkpoints()
+    return torch.load(checkpoint, map_location="cpu", mmap=True)
+
+
+class GuardedOptimizers(Optimizers):
+    """Nerfstudio's optimisers, which leave out a step that is not finite.
+
+    Args:
+        config: Optimisers and schedulers by the name of the group of parameters.
+        param_groups: Parameters by the name of the group.
+        is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed.
+    """
+
+    def __init__(
+        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]
+    ):
+        super().__init__(config, param_groups)
+        self.is_finite = is_finite
+        self.skipped = False
+        """Whether the last step was left out."""
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        self.skipped = not self.is_finite()
+        if self.skipped and not grad_scaler.is_enabled():
+            return
+        if self.skipped:  # the scaler must see it, to leave the step out itself
+            for group in param_groups:
+                for parameter in self.parameters[group]:
+                    if parameter.grad is not None:
+                        parameter.grad.fill_(torch.nan)
+        super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
 class EnerfTrainer(Trainer):
-    """Nerfstudio's trainer, ending with a list of what was made."""
+    """Nerfstudio's trainer, which survives: an interruption, a full disk, a step that is not finite.
+
+    A step whose losses or gradients are not finite changes neither parameters nor the state of the optimisers; the
+    learning rate goes on with the number of the step.
+    """
 
     config: EnerfTrainerConfig
     pipeline: EnerfPipeline
+    optimizers: GuardedOptimizers
+
+    def __init__(self, config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1):
+        super().__init__(config, local_rank, world_size)
+        self.num_skipped = 0
+        """Steps that were left out because they were not finite."""
+        self._skipped_in_a_row = 0
+        self._trained = -1  # the last step that was
+        self._interrupted = False
+        self._unsaved = ""  # why the last checkpoint could not be stored
+        self._found_wrong: set[str] = set()
+        self._handlers: dict[int, Any] = {}
+
+    def setup_optimizers(self) -> GuardedOptimizers:
+        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        if self.config.load_checkpoint is None:
+            return
+        state = load(self.config.load_checkpoint)
+        if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
+            set_random_state(state["generators"], self.pipeline.device)
+            self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
+        vars(self.pipeline.model.sampler).update(state.get("sampler", {}))
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Stores the run as it is after a step, whole or not at all; where the disk is full, the checkpoints that are
+        there stay, which is said, and training goes on."""
+        pipeline = self.pipeline
+        state = {
+            "step": step,
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+            "max_steps": {name: group["scheduler"].max_steps for name, group in self.config.optimizers.items()},
+            "device": pipeline.device.type,
+            "generators": {
+                **random_state(pipeline.device),
+                "batches": pipeline.datamanager.generator.get_state(),
+            },
+            "sampler": {name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS},
+        }
+        path = checkpoint_path(self.checkpoint_dir, step)
+        try:
+            write_checkpoint(path, state)
+        except OSError as error:
+            self._unsaved = f"Step {step} could not be stored in {self.checkpoint_dir} ({error.strerror or error})"
+            _say(f"{self._unsaved}; the checkpoints before it stay. Make room.")
+            return
+        self._unsaved = ""
+        if self.config.save_only_latest_checkpoint and not self._skipped_in_a_row:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink()
+
+    def train(self) -> None:
+        """Trains up to step `max_num_iterations` in total; interrupted by SIGINT or SIGTERM, stores a checkpoint first.
+
+        Raises:
+            SystemExit: With code 130, training was interrupted; with a sentence, it was given up, since steps in a row
+                were not finite, or the last checkpoint could not be stored.
+        """
+        config, total = self.config, self.config.max_num_iterations
+        self._trained = self._start_step - 1
+        if self._start_step >= total:
+            _say(f"The run in {self.base_dir} is at its end, at step {total} of {total}.")
+            return
+        self._handle_signals()
+        config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
+        try:
+            super().train()
+        finally:
+            config.max_num_iterations = total
+            self._restore_signals()
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        results = super().train_iteration(step)
+        self._trained = step
+        if self.optimizers.skipped:
+            self._look_at_skipped(step)
+        else:
+            self._skipped_in_a_row = 0
+        if step >= LEARNING_CHECKED_FROM and step % LEARNING_CHECKED_EVERY == 0:
+            self._look_at_learning(step)
+        if self._interrupted:
+            self.stop_training = True
+        return results
+
+    def _is_finite(self) -> bool:
+        """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
+
+        Where mixed precision scales the loss, gradients that overflow are the scaler's, who leaves them out.
+        """
+        numbers = list(self.pipeline.last_step.losses.values())
+        if self.grad_scaler.get_scale() <= 1:
+            gradients = [parameter.grad for parameter in self.pipeline.parameters() if parameter.grad is not None]
+            numbers += torch._foreach_norm(gradients)
+        return bool(torch.stack([number.float() for number in numbers]).isfinite().all())
+
+    def _look_at_skipped(self, step: int) -> None:
+        """Counts a step that was left out, keeps the batch of the first, and gives up after some in a row."""
+        seen = self.pipeline.last_step
+        terms = [name for name, loss in seen.losses.items() if not loss.isfinite()] + [
+            f"the gradient of {name}"
+            for name, parameter in self.pipeline.model.named_parameters()
+            if parameter.grad is not None and not parameter.grad.norm().isfinite()
+        ]
+        self.optimizers.zero_grad_all()  # of which some may be gathered over several steps
+        self.num_skipped += 1
+        self._skipped_in_a_row += 1
+        if self.num_skipped == 1:
+            file = self.base_dir / f"skipped-step-{step:09d}.pt"
+            content = io.BytesIO()
+            batch = {name: vars(part) for name, part in vars(seen.batch).items() if part is not None}
+            torch.save({"step": step, "losses": seen.losses, **batch}, content)
+            try:
+                write_whole(file, content.getvalue())
+            except OSError as error:
+                file = f"not kept ({error.strerror})"
+            _say(f"Step {step} is left out, since {terms[0]} is not finite; its batch is {file}.")
+        if self._skipped_in_a_row == MOST_SKIPPED:
+            raise SystemExit(
+                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a row; "
+                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
+                "recording."
+            )
+
+    @torch.no_grad()
+    def _look_at_learning(self, step: int) -> None:
+        """Says, once for each reason, that what is rendered is nothing."""
+        seen, sensor, found = self.pipeline.last_step, self.pipeline.model.sensor, {}
+        accumulation = float(seen.accumulation.mean())
+        if accumulation < NOTHING:
+            found["empty"] = f"rays meet no surface anywhere: they are stopped by {accumulation:.1g} of one on average"
+        events = seen.batch.events
+        if events is not None:
+            start, end, _ = seen.batch.split(seen.rgb)
+            fired = ~events.silent
+            change = brightness_change(start, end, events, sensor)[fired]
+            measured = sensor.measured_change(events.on[fired], events.off[fired], events.pixels[fired])
+            ratio = float(change.square().mean().sqrt() / measured.square().mean().sqrt())
+            if ratio < NOTHING:
+                found["constant"] = f"the rendered change of log brightness is {ratio:.1g} of the measured one"
+        for reason in found.keys() - self._found_wrong:
+            self._found_wrong.add(reason)
+            _say(
+                f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
+                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and clock "
+                "with `enerf inspect`."
+            )
+
+    def _handle_signals(self) -> None:
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._interrupt) or signal.SIG_DFL
+        except ValueError:  # not in the main thread, to which alone signals come
+            pass
+
+    def _restore_signals(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._interrupted:
+            raise SystemExit(130)
+        self._interrupted = self.stop_training = True
+        _say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
+
+    def _train_complete_viewer(self) -> None:
+        self._restore_signals()  # the viewer runs until it is interrupted
+        super()._train_complete_viewer()
 
     def _after_train(self) -> None:
-        super()._after_train()
+        self.step = self._trained  # where training was stopped, Nerfstudio has counted one further
         config = shlex.quote(str(self.base_dir / "config.yml"))
+        if self._trained + 1 < self._start_step + self.config.max_num_iterations:
+            if self._trained >= self._start_step:
+                self.save_checkpoint(self._trained)
+            writer.write_out_storage()
+            self._say_skipped()
+            CONSOLE.print(
+                f"[bold]continue:[/bold] ns-train {self.config.method_name} --load-config {config}",
+                soft_wrap=True,
+                highlight=False,
+            )
+            raise SystemExit(130)
+        super()._after_train()
+        if self._unsaved:
+            raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and train on.")
         CONSOLE.rule("Training is done")
+        self._say_skipped()
         for what, where in {
             "checkpoint": str(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
@@ -105,6 +436,14 @@ class EnerfTrainer(Trainer):
             "look around": f"ns-viewer --load-config {config}",
         }.items():
             CONSOLE.print(f"[bold]{what}:[/bold] {where}", soft_wrap=True, highlight=False)
+
+    def _say_skipped(self) -> None:
+        if self.num_skipped:
+            _say(f"{self.num_skipped} steps were left out, since they were not finite.")
+
+
+def _say(sentence: str) -> None:
+    CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
 
 
 def recording_table(config: EnerfTrainerConfig) -> Table:

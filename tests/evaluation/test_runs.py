@@ -87,8 +87,8 @@ def damaged_checkpoint(folder: Path) -> None:
     ("change", "reason"),
     [
         (lambda folder: shutil.rmtree(folder / "nerfstudio_models"), "its checkpoints are not found"),
-        (no_checkpoints, "its checkpoints are not found"),
-        (damaged_checkpoint, ""),
+        (no_checkpoints, "holds no whole checkpoint"),
+        (damaged_checkpoint, "holds no whole checkpoint"),
         (lambda folder: (folder / "config.yml").write_text("{"), "expected the node content"),
         (lambda folder: (folder / "config.yml").write_text("a: 1"), "AssertionError"),
         (lambda folder: (folder / "config.yml").write_text("!!python/object:nowhere.Nothing {}"), "nowhere"),

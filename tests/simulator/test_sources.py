@@ -337,9 +337,12 @@ def test_a_run_of_this_package_is_rendered_as_its_own_evaluation_does(tmp_path: 
     np.testing.assert_allclose(there.brightness(4), run.brightness(time)[:7, :9], atol=1e-4)
 
     checkpoints = config.parent / "nerfstudio_models"
-    for remove in (lambda: [file.unlink() for file in checkpoints.iterdir()], checkpoints.rmdir):
+    for remove, reason in (
+        (lambda: [file.unlink() for file in checkpoints.iterdir()], r".* holds no whole checkpoint.*"),
+        (checkpoints.rmdir, "its checkpoints are not found"),
+    ):
         remove()
-        with pytest.raises(RecordingError, match=r"config\.yml cannot be .* \(its checkpoints are not found\)"):
+        with pytest.raises(RecordingError, match=rf"config\.yml cannot be .* \({reason}\)"):
             TrainedRun(config)
     config.write_text(config.read_text().replace("- recording\n", "- nowhere\n"))
     with pytest.raises(RecordingError, match=r"config\.yml cannot be .* \(.*nowhere does not exist; .*\); give the"):

@@ -1,0 +1,243 @@
+"""Runs that are stopped and go on."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts.train import main
+from nerfstudio.utils import writer
+from small_runs import set_up, small_config
+
+from enerf_ns.enerf_trainer import EnerfTrainerConfig
+
+STEPS = 6
+
+
+def trained(config: EnerfTrainerConfig, first: int = 0, stop_after: int | None = None, by=signal.SIGTERM) -> Any:
+    """A trainer that trained from a step to the end, or until a signal came in the middle of a step."""
+    trainer = set_up(config)
+    if first:
+        trainer._start_step = first
+    draw = trainer.pipeline.datamanager.next_batch
+    steps = iter(range(trainer._start_step, config.max_num_iterations))
+
+    def interrupted_draw(sensor: Any) -> Any:
+        if trainer.pipeline.training and next(steps) == stop_after:
+            os.kill(os.getpid(), by)
+        return draw(sensor)
+
+    trainer.pipeline.datamanager.next_batch = interrupted_draw
+    if stop_after is None:
+        trainer.train()
+        return trainer
+    with pytest.raises(SystemExit) as stopped:
+        trainer.train()
+    assert stopped.value.code == 130
+    return trainer
+
+
+def stored(trainer: Any) -> EnerfTrainerConfig:
+    return yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+
+
+def checkpoints(trainer: Any) -> list[str]:
+    return sorted(file.name for file in trainer.checkpoint_dir.iterdir())
+
+
+def same(one: Any, other: Any, where: str = "") -> None:
+    """All of two checkpoints is equal, to the bit."""
+    assert type(one) is type(other), where
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other), where
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys(), where
+        for key in one:
+            same(one[key], other[key], f"{where}.{key}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other), where
+        for place, values in enumerate(zip(one, other, strict=True)):
+            same(*values, f"{where}.{place}")
+    else:
+        assert one == other, where
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("by", ["signal", "kill"])
+@pytest.mark.parametrize(
+    ("changes", "first"),
+    [
+        ({}, 0),
+        ({"data__supervision": "events+frames", "data__silent_pairs": 32}, 0),
+        ({"data__supervision": "frames"}, 0),
+        ({"model__sampling": "uniform"}, 0),
+        ({}, 498),  # from step 501 on, the proposal network learns at every other step
+    ],
+)
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(
+    recording: Path, tmp_path: Path, changes: dict, first: int, by: str
+):
+    """Weights, Adam's means, learning rates and the states of all generators, with evaluation between that draws, too;
+    stopped by a signal, or killed some steps after a checkpoint."""
+
+    def config(output_dir: str) -> EnerfTrainerConfig:
+        config = small_config(recording, tmp_path / output_dir, **changes)
+        config.max_num_iterations = first + STEPS
+        config.steps_per_eval_batch = config.steps_per_eval_image = 2
+        config.steps_per_save = 3
+        config.save_only_latest_checkpoint = False
+        return config
+
+    straight = trained(config("straight"), first)
+    last = f"step-{first + STEPS - 1:09d}.ckpt"
+    stopped = trained(config("stopped"), first, first + 2 if by == "signal" else first + 4)
+    if by == "kill":
+        (stopped.checkpoint_dir / checkpoints(stopped)[-1]).unlink()
+    assert checkpoints(stopped)[-1] == f"step-{first + (2 if by == 'signal' else 3):09d}.ckpt"
+    resumed = trained(stored(stopped))
+    assert resumed.base_dir == stopped.base_dir and checkpoints(resumed)[-1] == checkpoints(straight)[-1] == last
+    one, other = (torch.load(run.checkpoint_dir / last) for run in (straight, resumed))
+    same(one, other)
+    assert one["sampler"].get("_step", first + STEPS - 1) == first + STEPS - 1
+    assert one["schedulers"]["fields"]["last_epoch"] == STEPS
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_what_an_interrupted_run_prints_continues_it(recording: Path, tmp_path: Path, capsys, by: signal.Signals):
+    """The command is quoted for a shell; the last step that was trained names the checkpoint; handlers are put back."""
+    config = small_config(recording, tmp_path / "it's a folder")
+    config.max_num_iterations = 5
+    before = signal.getsignal(by)
+    trainer = trained(config, stop_after=1, by=by)
+    assert signal.getsignal(by) is before
+    assert checkpoints(trainer) == ["step-000000001.ckpt"]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("continue: ")]
+    command = shlex.split(line.removeprefix("continue: "))
+    assert command[:3] == ["ns-train", "enerf", "--load-config"]
+    config.load_config = Path(command[3])
+    written = (trainer.base_dir / "config.yml").read_text()
+    main(config)
+    assert checkpoints(trainer) == ["step-000000004.ckpt"]
+    assert (trainer.base_dir / "config.yml").read_text() == written
+    assert f"is at its end, at step 5 of 5" not in capsys.readouterr().out
+    main(config)
+    assert f"{trainer.base_dir} is at its end, at step 5 of 5." in capsys.readouterr().out
+    assert checkpoints(trainer) == ["step-000000004.ckpt"]
+
+
+def test_a_second_signal_stops_at_once(recording: Path, tmp_path: Path):
+    """In the same step, before a checkpoint is stored."""
+    trainer = set_up(small_config(recording, tmp_path))
+    draw = trainer.pipeline.datamanager.next_batch
+
+    def twice(sensor: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return draw(sensor)
+
+    trainer.pipeline.datamanager.next_batch = twice
+    with pytest.raises(SystemExit) as stopped:
+        trainer.train()
+    assert stopped.value.code == 130 and not trainer.checkpoint_dir.exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_in_the_last_step_leaves_a_run_that_is_done(recording: Path, tmp_path: Path, capsys):
+    trainer = set_up(small_config(recording, tmp_path))
+    trainer.pipeline.datamanager.next_batch, draw = (
+        lambda sensor: (os.kill(os.getpid(), signal.SIGINT) if trainer.step == 1 else None, draw(sensor))[1],
+        trainer.pipeline.datamanager.next_batch,
+    )
+    trainer.train()
+    assert "Training is done" in capsys.readouterr().out and checkpoints(trainer) == ["step-000000001.ckpt"]
+
+
+def test_a_longer_run_goes_on_from_the_checkpoints_of_another(recording: Path, tmp_path: Path):
+    """In a folder of its own, up to as many steps in total, with the learning rate that the first ended with."""
+    first = trained(small_config(recording, tmp_path))
+    config = small_config(recording, tmp_path)
+    config.timestamp, config.max_num_iterations = "longer", 5
+    config.load_dir = first.checkpoint_dir
+    longer = trained(config)
+    assert checkpoints(first) == ["step-000000001.ckpt"] and checkpoints(longer) == ["step-000000004.ckpt"]
+    one, other = (torch.load(trainer.checkpoint_dir / checkpoints(trainer)[0]) for trainer in (first, longer))
+    assert one["max_steps"] == other["max_steps"] == {"fields": 2, "sensor": 2}
+    rates = [state["optimizers"]["fields"]["param_groups"][0]["lr"] for state in (one, other)]
+    assert rates[0] == rates[1] == pytest.approx(0.1 * config.optimizers["fields"]["optimizer"].lr)
+    assert {int(state["step"]) for state in other["optimizers"]["fields"]["state"].values()} == {5}
+    config.max_num_iterations, config.timestamp = 2, "shorter"
+    with pytest.raises(SystemExit, match=r"--max-num-iterations 2 counts the 2 steps of .*step-000000001\.ckpt"):
+        config.save_config()
+    assert not first.base_dir.with_name("shorter").exists()
+
+
+def test_a_run_goes_on_in_place_after_it_was_extended_from_a_step(recording: Path, tmp_path: Path):
+    """What was loaded first stands in config.yml, and counts until the run has a checkpoint of its own."""
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = 4, 1, False
+    first = trained(config)
+    config.timestamp, config.max_num_iterations = "second", 6
+    config.load_dir, config.load_step = first.checkpoint_dir, 1
+    second = trained(config, stop_after=3)
+    assert checkpoints(second) == ["step-000000002.ckpt", "step-000000003.ckpt"]
+    again = trained(stored(second))
+    assert checkpoints(again) == [f"step-{step:09d}.ckpt" for step in (2, 3, 4, 5)]
+    for file in again.checkpoint_dir.iterdir():
+        file.unlink()
+    again.checkpoint_dir.rmdir()
+    assert set_up(stored(second))._start_step == 2
+
+
+def test_a_run_that_is_there_is_not_written_over(recording: Path, tmp_path: Path):
+    first = trained(small_config(recording, tmp_path))
+    before = {file: file.read_bytes() for file in first.base_dir.rglob("*") if file.is_file()}
+    config = small_config(recording, tmp_path, data__event_pairs=32)
+    for start in (config.save_config, config.setup):
+        with pytest.raises(SystemExit, match=r"run holds a run already; continue it with --load-config .*config\.yml,"):
+            start()
+    assert {file: file.read_bytes() for file in first.base_dir.rglob("*") if file.is_file()} == before
+
+
+def test_what_is_left_is_told_of_the_run_as_a_whole(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations = 20
+    trainer = trained(config, stop_after=9)
+    trainer = set_up(stored(trainer))
+    shares = []
+    put_time = writer.put_time
+
+    def noted(*args: Any, **kwargs: Any) -> None:
+        put_time(*args, **kwargs)
+        if kwargs.get("update_eta"):
+            shares.append((kwargs["step"] / writer.GLOBAL_BUFFER["max_iter"], writer.GLOBAL_BUFFER["events"][ETA]))
+
+    ETA = writer.EventName.ETA.value
+    writer.put_time = noted
+    try:
+        trainer.train()
+    finally:
+        writer.put_time = put_time
+    assert [share for share, _ in shares] == pytest.approx([step / 20 for step in range(10, 20)])
+    assert not any("h" in left for _, left in shares)
+
+
+@pytest.mark.parametrize(("flag", "value"), [("load_dir", "nowhere"), ("load_checkpoint", "nowhere.ckpt")])
+def test_a_checkpoint_that_is_not_there_is_one_sentence(recording: Path, tmp_path: Path, flag: str, value: str):
+    config = small_config(recording, tmp_path)
+    setattr(config, flag, tmp_path / value)
+    with pytest.raises(SystemExit, match=r"^enerf: .*nowhere.* does not exist; give "):
+        config.save_config()
+    assert not list(tmp_path.iterdir())
