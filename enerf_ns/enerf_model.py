@@ -49,8 +49,9 @@ class EnerfModelConfig(ModelConfig):
     """Numbers that the density network tells the colour network."""
     view_direction: bool = False
     """Let colour depend on the viewing direction: for shiny scenes that are seen from many sides."""
-    brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
-    """What the colour network's output spans evenly: log brightness, or brightness as in the paper."""
+    brightness: Literal["log-sigmoid", "sigmoid", "exponential"] = "log-sigmoid"
+    """What the colour network's output spans evenly: log brightness between limits, brightness as in the paper, or log
+    brightness without an upper limit, for scenes of high dynamic range."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
     sampling: Literal["proposal", "uniform"] = "proposal"
@@ -95,14 +96,15 @@ class EnerfModelConfig(ModelConfig):
 class BoxCollider(AABBBoxCollider):
     """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
 
-    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw.
+    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that miss
+    the box, or only graze it, are as good as without length.
     """
 
     def forward(self, ray_bundle: RayBundle) -> RayBundle:
         ray_bundle = self.set_nears_and_fars(ray_bundle)
         assert ray_bundle.nears is not None and ray_bundle.fars is not None
-        ray_bundle.nears = ray_bundle.nears.clamp(min=self.near_plane)
-        ray_bundle.fars = torch.maximum(ray_bundle.fars, ray_bundle.nears + 1e-4)
+        nears = ray_bundle.nears.nan_to_num(0.0, posinf=0.0).clamp(min=self.near_plane)
+        ray_bundle.nears, ray_bundle.fars = nears, torch.maximum(ray_bundle.fars.nan_to_num(0.0, 0.0), nears + 1e-4)
         return ray_bundle
 
 
@@ -127,7 +129,7 @@ class EnerfModel(Model):
             num_channels=config.num_channels,
             view_direction=config.view_direction,
             hidden_dim_colour=config.hidden_dim_colour,
-            log_sigmoid=config.brightness == "log-sigmoid",
+            brightness=config.brightness,
             num_features=config.num_features,
             num_levels=config.num_levels,
             min_res=config.base_res,
@@ -137,6 +139,8 @@ class EnerfModel(Model):
         )
         self.proposal = None
         if config.sampling == "proposal":
+            # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
+            # thirtieth (float16) of what their jitter does
             self.proposal = HashDensity(
                 aabb, num_levels=5, min_res=16, max_res=max(16, config.max_res // 2), log2_table_size=15, hidden_dim=16
             )
@@ -269,7 +273,7 @@ class EnerfModel(Model):
             align = align_channels if self.sensor.colour_filter else align_brightness
             rendered = align([rendered], [recorded])[0][0]
             scores = image_metrics(rendered, recorded)
-        images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max()}
+        images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max().clamp(min=1e-9)}
         return scores, images
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
