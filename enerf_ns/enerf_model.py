@@ -8,7 +8,9 @@ from typing import Annotated, Any, Literal, Optional, Type  # noqa: UP035 - tyro
 
 import torch
 import tyro
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
@@ -183,8 +185,9 @@ class EnerfModel(Model):
             ray_bundle: Any rays; in training usually a `PairedRayBundle`.
 
         Returns:
-            rgb (rays, 3) in [0, 1], depth (rays, 1) in scene units along the ray, accumulation (rays, 1) and, outside
-            training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training also what the losses need.
+            rgb (rays, 3), at most 1 but where brightness is exponential, depth (rays, 1) in scene units along the ray,
+            accumulation (rays, 1) and, outside training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training
+            also what the losses need.
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
@@ -275,6 +278,11 @@ class EnerfModel(Model):
             scores = image_metrics(rendered, recorded)
         images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max().clamp(min=1e-9)}
         return scores, images
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """What the viewer and ns-render show of a camera: brightness above 1 is white, where theirs would wrap round."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        return outputs | {"rgb": outputs["rgb"].clamp(max=1.0)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)

@@ -11,6 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from small_runs import set_up, small_config
 
+from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
 
@@ -158,6 +159,19 @@ def test_under_autocast_only_the_proposal_network_is_half(pipeline: Any, dtype: 
         torch.testing.assert_close(step(True), step(False), rtol=0, atol=0)
     finally:
         model.sampler, model.proposal = sampler, proposal
+
+
+def test_brightness_above_white_is_scored_as_it_is_and_shown_as_white(recording: Path, tmp_path: Path):
+    pipeline = set_up(small_config(recording, tmp_path, model__brightness="exponential")).pipeline
+    with torch.no_grad():
+        pipeline.model.field.colour_network.layers[-1].bias += 10.0
+        pipeline.model.field.geometry.network.layers[-1].bias[0] += 8.0
+    pipeline.eval()
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    shown = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    scored = held_out_views(pipeline)[0][0].unaligned
+    assert scored.isfinite().all() and (scored > 1).any()
+    torch.testing.assert_close(shown, scored.clamp(max=1.0))
 
 
 def test_a_picture_without_depth_is_shown(pipeline: Any):

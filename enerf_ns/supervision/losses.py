@@ -76,13 +76,14 @@ def no_event_loss(
 
 @full_precision
 def frame_loss(rendered: Float[Tensor, "rays 3"], recorded: Float[Tensor, "rays 3"], grey: bool) -> Float[Tensor, ""]:
-    """Mean squared error between rendered and recorded pixels, both in [0, 1].
+    """Mean squared error between rendered and recorded pixels. What is recorded as 1 may be any brighter.
 
     Args:
-        rendered: What the field shows.
-        recorded: What the frames show.
+        rendered: What the field shows, 0 or more.
+        recorded: What the frames show, in [0, 1].
         grey: Compare brightness alone (luma), as where the field is grey; frames that are grey are always compared so.
     """
+    rendered = torch.where(recorded >= 1.0, rendered.clamp(max=1.0), rendered)
     if grey or (recorded == recorded[..., :1]).all():
         rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
     return torch.mean((rendered - recorded) ** 2)
