@@ -57,7 +57,10 @@ def is_whole(path: Path) -> bool:
 @cache
 def _say_passed_over(path: Path) -> None:
     CONSOLE.print(
-        f"{path} is cut short or damaged; the checkpoint before it is used.", soft_wrap=True, markup=False, style="yellow"
+        f"{path} is cut short or damaged; the checkpoint before it is used.",
+        soft_wrap=True,
+        markup=False,
+        style="yellow",
     )
 
 

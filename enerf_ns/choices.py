@@ -23,7 +23,9 @@ from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
 from enerf_ns.enerf_model import EnerfModelConfig
+from enerf_ns.events.brightness_range import log_brightness_range
 from enerf_ns.events.statistics import border_rate, silent_share
 from enerf_ns.paper_selections import preset_named, selections
 from enerf_ns.sensor.response import ColourFilter, response_named
@@ -205,6 +207,7 @@ class _Resolver:
         self._events()
         self._silent_pixels()
         self._sensor()
+        self._dynamic_range()
         self._frames()
         self._colour()
         self._scene()
@@ -336,6 +339,18 @@ class _Resolver:
         self.use("model.sensor.width", lambda: recording.camera.width)
         if pattern != GREY:
             _check("--pipeline.model.bayer-pattern", lambda: ColourFilter(pattern, recording.camera.width))
+
+    def _dynamic_range(self) -> None:
+        """Whether brightness has an upper limit."""
+        name, why = "model.brightness", "no events are used"
+        spread = 0.0
+        if self.use_events:
+            thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
+            spread = log_brightness_range(index_events(self.recording), thresholds)
+            fits = "more" if spread > LOG_SIGMOID_RANGE else "less"
+            why = f"events of a pixel span {spread:.2g} of log brightness, {fits} than {LOG_SIGMOID_RANGE:g}"
+        activation = self.use(name, lambda: "exponential" if spread > LOG_SIGMOID_RANGE else "log-sigmoid")
+        self.row("high dynamic range", activation == "exponential", activation, self.why(name, why), name)
 
     def _frames(self) -> None:
         """Whether frames are learnt from, and whether a second camera took them."""

@@ -8,7 +8,9 @@ from typing import Annotated, Any, Literal, Optional, Type  # noqa: UP035 - tyro
 
 import torch
 import tyro
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
@@ -50,8 +52,9 @@ class EnerfModelConfig(ModelConfig):
     view_direction: Optional[bool] = None  # noqa: UP045
     """Let brightness depend on the viewing direction, for shiny scenes that are seen from many sides. None: where the
     camera goes around the scene and a short training shows that it helps."""
-    brightness: Literal["log-sigmoid", "sigmoid"] = "log-sigmoid"
-    """What the colour network's output spans evenly: log brightness, or brightness as in the paper."""
+    brightness: Optional[Literal["log-sigmoid", "sigmoid", "exponential"]] = None  # noqa: UP045
+    """What the colour network's output spans evenly: log brightness between limits, brightness as in the paper, or log
+    brightness without an upper limit, for scenes of high dynamic range. None: within limits where the events fit."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
     sampling: Optional[Literal["proposal", "uniform"]] = None  # noqa: UP045
@@ -98,14 +101,15 @@ class EnerfModelConfig(ModelConfig):
 class BoxCollider(AABBBoxCollider):
     """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
 
-    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw.
+    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that miss
+    the box, or only graze it, are as good as without length.
     """
 
     def forward(self, ray_bundle: RayBundle) -> RayBundle:
         ray_bundle = self.set_nears_and_fars(ray_bundle)
         assert ray_bundle.nears is not None and ray_bundle.fars is not None
-        ray_bundle.nears = ray_bundle.nears.clamp(min=self.near_plane)
-        ray_bundle.fars = torch.maximum(ray_bundle.fars, ray_bundle.nears + 1e-4)
+        nears = ray_bundle.nears.nan_to_num(0.0, posinf=0.0).clamp(min=self.near_plane)
+        ray_bundle.nears, ray_bundle.fars = nears, torch.maximum(ray_bundle.fars.nan_to_num(0.0, 0.0), nears + 1e-4)
         return ray_bundle
 
 
@@ -118,7 +122,7 @@ class EnerfModel(Model):
         super().populate_modules()
         config = self.config
         assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
-        assert config.sampling and config.view_direction is not None and config.opacity_loss_weight is not None
+        assert config.sampling and config.brightness and config.view_direction is not None and config.opacity_loss_weight is not None
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
         self.supervision = EventSupervision(
@@ -131,7 +135,7 @@ class EnerfModel(Model):
             num_channels=config.num_channels,
             view_direction=config.view_direction,
             hidden_dim_colour=config.hidden_dim_colour,
-            log_sigmoid=config.brightness == "log-sigmoid",
+            brightness=config.brightness,
             num_features=config.num_features,
             num_levels=config.num_levels,
             min_res=config.base_res,
@@ -141,6 +145,8 @@ class EnerfModel(Model):
         )
         self.proposal = None
         if config.sampling == "proposal":
+            # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
+            # thirtieth (float16) of what their jitter does
             self.proposal = HashDensity(
                 aabb, num_levels=5, min_res=16, max_res=max(16, config.max_res // 2), log2_table_size=15, hidden_dim=16
             )
@@ -183,8 +189,9 @@ class EnerfModel(Model):
             ray_bundle: Any rays; in training usually a `PairedRayBundle`.
 
         Returns:
-            rgb (rays, 3) in [0, 1], depth (rays, 1) in scene units along the ray, accumulation (rays, 1) and, outside
-            training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training also what the losses need.
+            rgb (rays, 3), at most 1 but where brightness is exponential, depth (rays, 1) in scene units along the ray,
+            accumulation (rays, 1) and, outside training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training
+            also what the losses need.
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
@@ -285,6 +292,11 @@ class EnerfModel(Model):
             "depth": depth / depth.max().clamp(min=1e-12),
         }
         return scores, images
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """What the viewer and ns-render show of a camera: brightness above 1 is white, where theirs would wrap round."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        return outputs | {"rgb": outputs["rgb"].clamp(max=1.0)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)

@@ -204,9 +204,7 @@ class GuardedOptimizers(Optimizers):
         is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed.
     """
 
-    def __init__(
-        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]
-    ):
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]):
         super().__init__(config, param_groups)
         self.is_finite = is_finite
         self.skipped = False
@@ -276,7 +274,9 @@ class EnerfTrainer(Trainer):
                 **random_state(pipeline.device),
                 "batches": pipeline.datamanager.generator.get_state(),
             },
-            "sampler": {name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS},
+            "sampler": {
+                name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
+            },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
         try:

@@ -8,9 +8,12 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from small_runs import set_up, small_config
 
-from enerf_ns.sensor.response import luma
+from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.ray_samplers import PairedUniformSampler
+from enerf_ns.sensor.response import linlog, luma
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +81,104 @@ def test_every_parameter_is_in_one_group(pipeline: Any):
         id(parameter) for name, parameter in pipeline.model.named_parameters() if name != "device_indicator_param"
     }
     assert set(groups) == {"fields"} and len(grouped) == len(set(grouped)) and set(grouped) == trained
+
+
+STRANGE_RAYS = {
+    "misses": ([50.0, 50.0, 50.0], [1.0, 0.0, 0.0]),
+    "starts far behind": ([0.0, 0.0, -1e6], [0.0, 0.0, 1.0]),
+    "grazes a face": ([-3.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
+    "starts on a face, and leaves": ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+    "touches a corner": ([-2.0, 0.0, 1.0], [0.70710678, 0.70710678, 0.0]),
+    "is as steep as what Nerfstudio adds to directions": ([1.0, 0.5, 0.0], [-1e-6, 0.0, 1.0]),
+    "has no direction": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("logit", [-1e4, -95.0, 0.0, 88.8, 1e4])
+@pytest.mark.parametrize("training", [False, True])
+def test_all_is_finite_for_any_ray_and_density(pipeline: Any, training: bool, logit: float):
+    """Densities of 0, subnormal ones and those above float32, in the field and in the proposal network."""
+    origins, directions = (torch.tensor(column) for column in zip(*STRANGE_RAYS.values(), strict=True))
+    lengths = torch.ones(len(origins), 1)
+    biases = [network.network.layers[-1].bias for network in (pipeline.model.field.geometry, pipeline.model.proposal)]
+    kept = [bias.detach().clone() for bias in biases]
+    with torch.no_grad():
+        for bias in biases:
+            bias[0] = logit
+    pipeline.train(training)
+    pipeline.zero_grad()
+    outputs = pipeline.model(RayBundle(origins, directions, lengths, metadata={"directions_norm": lengths}))
+    assert all(outputs[name].isfinite().all() for name in ("rgb", "depth", "accumulation"))
+    if training:
+        losses = [
+            (outputs["rgb"] ** 2).mean(),
+            (1.0 - outputs["accumulation"]).mean(),
+            distortion_loss(outputs["weights_list"], outputs["ray_samples_list"]),
+            interlevel_loss(outputs["weights_list"], outputs["ray_samples_list"]),
+        ]
+        assert all(loss.isfinite() for loss in losses)
+        torch.stack(losses).sum().backward()
+        gradients = [parameter.grad for parameter in pipeline.model.parameters() if parameter.grad is not None]
+        assert gradients and all(gradient.isfinite().all() for gradient in gradients)
+    else:
+        assert outputs["normals"].isfinite().all()
+    with torch.no_grad():
+        for bias, value in zip(biases, kept, strict=True):
+            bias.copy_(value)
+    pipeline.zero_grad()
+    pipeline.train()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_under_autocast_only_the_proposal_network_is_half(pipeline: Any, dtype: torch.dtype):
+    """With samples that do not hang on it, losses and gradients of a step are equal to the bit; the proposal network
+    moves changes of log brightness by less than the jitter of the samples does."""
+    model, manager = pipeline.model, pipeline.datamanager
+    state = manager.generator.get_state()
+
+    def step(half: bool, seed: int = 0) -> tuple[dict, dict, torch.Tensor]:
+        manager.generator.set_state(state)
+        torch.manual_seed(seed)
+        pipeline.zero_grad()
+        with torch.autocast("cpu", dtype=dtype, enabled=half):
+            outputs, losses, metrics = pipeline.get_train_loss_dict(0)
+        sum(losses.values()).backward()
+        assert all(value.dtype == torch.float32 for value in (losses | metrics).values())
+        assert all(output.dtype == torch.float32 for output in (outputs["rgb"], *outputs["weights_list"]))
+        start, end = outputs["rgb"].detach()[: 2 * manager.config.event_pairs].chunk(2)
+        gradients = {name: value.grad for name, value in model.named_parameters() if value.grad is not None}
+        return losses | metrics, gradients, linlog(end) - linlog(start)
+
+    sampler, proposal = model.sampler, model.proposal
+    _, _, expected = step(False)
+    error = (step(True)[2] - expected).square().mean()
+    assert 0 < error < 0.1 * (step(False, seed=1)[2] - expected).square().mean()
+
+    model.sampler, model.proposal = PairedUniformSampler(16).train(), None
+    try:
+        torch.testing.assert_close(step(True), step(False), rtol=0, atol=0)
+    finally:
+        model.sampler, model.proposal = sampler, proposal
+
+
+def test_brightness_above_white_is_scored_as_it_is_and_shown_as_white(recording: Path, tmp_path: Path):
+    pipeline = set_up(small_config(recording, tmp_path, model__brightness="exponential")).pipeline
+    with torch.no_grad():
+        pipeline.model.field.colour_network.layers[-1].bias += 10.0
+        pipeline.model.field.geometry.network.layers[-1].bias[0] += 8.0
+    pipeline.eval()
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    shown = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    scored = held_out_views(pipeline)[0][0].unaligned
+    assert scored.isfinite().all() and (scored > 1).any()
+    torch.testing.assert_close(shown, scored.clamp(max=1.0))
+
+
+def test_a_picture_without_depth_is_shown(pipeline: Any):
+    zeros = torch.zeros(12, 12, 1)
+    outputs = {"rgb": torch.rand(12, 12, 3), "depth": zeros, "accumulation": zeros}
+    _, images = pipeline.model.get_image_metrics_and_images(outputs, {"image": torch.rand(12, 12, 3), "is_frame": True})
+    assert torch.equal(images["depth"], zeros)
 
 
 def test_a_ray_that_misses_the_box_is_black_and_nothing(pipeline: Any):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.precision import full_precision
 
 
 class PosedCamera:
@@ -40,6 +41,7 @@ class PosedCamera:
         self._directions = torch.from_numpy(directions / norms).float().to(device)
         self._norms = torch.from_numpy(norms).float().to(device)
 
+    @full_precision
     def rays(
         self,
         pixels: Int64[Tensor, " rays"],

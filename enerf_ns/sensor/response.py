@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from enerf_ns.precision import full_precision
+
 LINEAR_UNTIL = 20.0
 """Brightness (of 255) below which linlog is linear, and above which it is logarithmic; B of the E-NeRF paper."""
 
@@ -136,6 +138,7 @@ LUMA = (0.299, 0.587, 0.114)
 """Shares of red, green and blue in what a grey sensor sees (ITU-R BT.601)."""
 
 
+@full_precision
 def luma(rgb: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch"]:
     """Brightness that a grey sensor sees of one or three colour channels (ITU-R BT.601 weights)."""
     if rgb.shape[-1] == 1:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from enerf_ns.events.batch import EventBatch
+from enerf_ns.precision import full_precision
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.losses import (
     huber_event_loss,
@@ -70,6 +71,7 @@ class EventSupervision:
         return losses
 
     @torch.no_grad()
+    @full_precision
     def metrics(
         self,
         start: Float[Tensor, "pairs channels"],
@@ -84,6 +86,7 @@ class EventSupervision:
         return {"event_correlation": torch.corrcoef(torch.stack([change, measured]))[0, 1]}
 
 
+@full_precision
 def brightness_change(
     start: Float[Tensor, "pairs channels"],
     end: Float[Tensor, "pairs channels"],

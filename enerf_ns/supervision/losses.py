@@ -1,4 +1,4 @@
-"""The losses of E-NeRF (Klenk et al., RA-L 2023), as pure functions of tensors."""
+"""The losses of E-NeRF (Klenk et al., RA-L 2023), as pure functions of tensors; formed in float32 or better."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from enerf_ns.precision import full_precision
 from enerf_ns.sensor.response import luma
 
 
+@full_precision
 def squared_event_loss(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float | Tensor
 ) -> Float[Tensor, ""]:
@@ -25,6 +27,7 @@ def squared_event_loss(
     return torch.mean(((predicted - measured) / mean_threshold) ** 2)
 
 
+@full_precision
 def huber_event_loss(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float | Tensor
 ) -> Float[Tensor, ""]:
@@ -39,6 +42,7 @@ def huber_event_loss(
     return 2.0 * torch.nn.functional.huber_loss(error, torch.zeros_like(error))
 
 
+@full_precision
 def normalised_event_loss(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], eps: float = 1e-9
 ) -> Float[Tensor, ""]:
@@ -50,6 +54,7 @@ def normalised_event_loss(
     return torch.sum(difference**2)
 
 
+@full_precision
 def no_event_loss(
     predicted: Float[Tensor, " pairs"], thresholds: tuple[float | Tensor, float | Tensor], margin: float = 1.0
 ) -> Float[Tensor, ""]:
@@ -69,14 +74,16 @@ def no_event_loss(
     return torch.mean(excess) / (0.5 * (on + off))
 
 
+@full_precision
 def frame_loss(rendered: Float[Tensor, "rays 3"], recorded: Float[Tensor, "rays 3"], grey: bool) -> Float[Tensor, ""]:
-    """Mean squared error between rendered and recorded pixels, both in [0, 1].
+    """Mean squared error between rendered and recorded pixels. What is recorded as 1 may be any brighter.
 
     Args:
-        rendered: What the field shows.
-        recorded: What the frames show.
+        rendered: What the field shows, 0 or more.
+        recorded: What the frames show, in [0, 1].
         grey: Compare brightness alone (luma), as where the field is grey; frames that are grey are always compared so.
     """
+    rendered = torch.where(recorded >= 1.0, rendered.clamp(max=1.0), rendered)
     if grey or (recorded == recorded[..., :1]).all():
         rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
     return torch.mean((rendered - recorded) ** 2)
