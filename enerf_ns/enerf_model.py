@@ -122,7 +122,12 @@ class EnerfModel(Model):
         super().populate_modules()
         config = self.config
         assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
-        assert config.sampling and config.brightness and config.view_direction is not None and config.opacity_loss_weight is not None
+        assert (
+            config.sampling
+            and config.brightness
+            and config.view_direction is not None
+            and config.opacity_loss_weight is not None
+        )
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
         self.supervision = EventSupervision(

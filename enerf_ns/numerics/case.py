@@ -42,7 +42,7 @@ class Result:
 
 
 CASES: list[Case] = []
-"""All cases, in the order of the modules that hold them (`all_cases` imports these)."""
+"""All cases of the modules that are imported; `enerf_ns.numerics.all_cases` imports all."""
 
 
 def case(name: str, expected: str, bound: float = 0.0, unit: str = "") -> Callable[[Measure], Measure]:
