@@ -63,13 +63,9 @@ class EventPairSampler:
         self.window = mode == "window"
         self.max_distance = 1 if mode == "successor" else max_distance
 
-        instants = _last_of_each(index)
-        if stretches is not None:
-            _drop_outside(instants, index, stretches)
+        instants = _last_of_each(index, None, stretches)
         if self.window:
             lasts = _last_of_each(index, window_ns, stretches)
-            if stretches is not None:
-                _drop_outside(lasts, index, stretches)
             instants &= ~lasts
             self._lasts = _places(lasts)
             del lasts  # it takes a byte an event
@@ -179,7 +175,8 @@ class SilentPixelSampler:
             if not used.any():
                 raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
             begins, ends = begins[used], ends[used]
-            self._stretches = begins, ends, (ends - begins + 1).cumsum(0)
+            after = (ends - begins + 1).cumsum(0)
+            self._stretches = begins, ends, after, int(after[-1])
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
@@ -232,21 +229,21 @@ class SilentPixelSampler:
         if self._stretches is None:
             instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=device)
             return instant, self.start_ns, self.end_ns
-        begins, ends, after = self._stretches
-        place = torch.randint(int(after[-1]), (draws,), generator=generator, device=device)
+        begins, ends, after, total = self._stretches
+        place = torch.randint(total, (draws,), generator=generator, device=device)
         stretch = torch.searchsorted(after, place, right=True)
         return ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
 
 
 def _last_of_each(
-    index: EventIndex, window_ns: int | None = None, stretches: Int64[Tensor, "stretches 2"] | None = None
+    index: EventIndex, window_ns: int | None, stretches: Int64[Tensor, "stretches 2"] | None
 ) -> Bool[Tensor, " events"]:
     """Whether each event is the last of its pixel at this time, or in its window of time since the first event.
 
     Args:
         index: The events.
         window_ns: Length of the windows; None: the same time.
-        stretches: Whose ends end windows too.
+        stretches: Whose ends end windows too; outside of them no event is the last. None: all of time.
     """
     times = index.times
     origin = index.span[0] if window_ns is not None and len(times) else 0
@@ -261,13 +258,10 @@ def _last_of_each(
         if part is not None:
             chunk |= part[1:] != part[:-1]
     last[index.offsets[1:][index.offsets.diff() > 0] - 1] = True
+    if stretches is not None:
+        for first in range(0, len(times), CHUNK):
+            last[first : first + CHUNK] &= _part(times[first : first + CHUNK], stretches) % 2 == 1
     return last
-
-
-def _drop_outside(chosen: Bool[Tensor, " events"], index: EventIndex, stretches: Int64[Tensor, "stretches 2"]) -> None:
-    """Chooses no events outside of the stretches."""
-    for first in range(0, len(chosen), CHUNK):
-        chosen[first : first + CHUNK] &= _part(index.times[first : first + CHUNK], stretches) % 2 == 1
 
 
 def _part(times: Int64[Tensor, " times"], stretches: Int64[Tensor, "stretches 2"]) -> Int64[Tensor, " times"]:

@@ -187,6 +187,17 @@ def test_a_recording_without_frames_needs_none():
     assert find_problems(made(frame_times=FRAME_TIMES[:0])) == []
 
 
+def test_events_of_one_instant_alone_are_counted():
+    """Fewer than tell that the times are in another unit."""
+    events = good_events(np.random.default_rng(0), 900)
+    events[:, 2] = SECOND
+    recording = made(events)
+    statistics = event_statistics(recording)
+    assert statistics.num_events == 900 and statistics.edges[0] == statistics.edges[-1] == SECOND
+    assert (statistics.rate * 1e-9).sum() == 900  # in the nanosecond that an instant is taken to last
+    assert any("events a pixel" in problem.what for problem in find_problems(recording))
+
+
 def test_what_the_events_do_not_need_is_no_problem():
     """Neither a gap between poses after the last event, nor a wrong pose before the first one."""
     events = good_events(np.random.default_rng(2))
