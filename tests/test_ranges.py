@@ -70,7 +70,9 @@ class Setting:
     def flag(self) -> str:
         """How a message is to name it."""
         dotted = str(self)
-        if dotted.startswith(("pipeline.defaults.", "pipeline.datamanager.pixel_sampler.", "pipeline.model.sensor.width")):
+        if dotted.startswith(
+            ("pipeline.defaults.", "pipeline.datamanager.pixel_sampler.", "pipeline.model.sensor.width")
+        ):
             return dotted  # which no flag sets
         if dotted.startswith("pipeline.datamanager.dataparser."):
             return "event-data --" + self.path[-1].replace("_", "-")
@@ -195,13 +197,33 @@ def test_flags_of_messages_are_those_of_ns_train():
 @pytest.mark.parametrize(
     ("part", "changes", "message"),
     [
-        ("parser", {"depth_range": (2.0, 2.0)}, r"^event-data --depth-range is 2 2, but the second .* above the first\.$"),
-        ("parser", {"time_range": (3.0, 1.0)}, r"^event-data --time-range is 3 1, but the second .* above the first\.$"),
+        (
+            "parser",
+            {"depth_range": (2.0, 2.0)},
+            r"^event-data --depth-range is 2 2, but the second .* above the first\.$",
+        ),
+        (
+            "parser",
+            {"time_range": (3.0, 1.0)},
+            r"^event-data --time-range is 3 1, but the second .* above the first\.$",
+        ),
         ("parser", {"box": (0.0, 0.0, 0.0, 0.0)}, r"^event-data --box is 0 0 0 0, but half its side must be at least"),
-        ("model", {"base_res": 65, "max_res": 64}, r"^--pipeline\.model\.max-res is 64, but .*base-res, which is 65\.$"),
-        ("scheduler", {"warmup_steps": 4000}, r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps in"),
+        (
+            "model",
+            {"base_res": 65, "max_res": 64},
+            r"^--pipeline\.model\.max-res is 64, but .*base-res, which is 65\.$",
+        ),
+        (
+            "scheduler",
+            {"warmup_steps": 4000},
+            r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps of",
+        ),
         ("scheduler", {"warmup_steps": 9, "max_steps": 9}, r"warmup-steps is 9, but must be below the 9 steps"),
-        ("resolution", {"values": {"model.near_plane": math.nan}}, r"^pipeline\.resolution\.values\.model\.near_plane is"),
+        (
+            "resolution",
+            {"values": {"model.near_plane": math.nan}},
+            r"^pipeline\.resolution\.values\.model\.near_plane is",
+        ),
     ],
 )
 def test_numbers_that_do_not_fit_one_another_are_refused(part: str, changes: dict[str, Any], message: str):

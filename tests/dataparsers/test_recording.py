@@ -45,6 +45,10 @@ def test_nothing_is_noted_when_nothing_is_dropped():
     [
         (dict(contrast_thresholds=(0.2, 0.0)), r"contrast thresholds 0\.2 \(of on events\) and 0"),
         (dict(contrast_thresholds=(float("nan"), 0.2)), "both must be from 0.001 to 10"),
+        (dict(contrast_thresholds=(1e-45, 1e-45)), r"contrast thresholds 1e-45 \(of on events\) and 1e-45"),
+        (dict(contrast_thresholds=(0.2, 10.1)), r"0\.2 \(of on events\) and 10\.1"),
+        (dict(depth_range=(1e-7, 1.0)), "range of depth 1e-07 m to 1 m"),
+        (dict(depth_range=(1.0, 1.1e9)), "both from 1e-06 m to 1e.09 m"),
         (dict(refractory_period=-1), "refractory period -1 ns"),
         (dict(refractory_period=10**13), "refractory period 1e.13 ns"),
         (dict(bayer_pattern="RGB"), "Bayer pattern 'RGB'"),

@@ -128,8 +128,12 @@ def test_depth_is_coloured_from_the_nearest_to_the_farthest(run: Run, tmp_path: 
     assert asked["depth_far_plane"] == pytest.approx(far * scale) and asked["depth_near_plane"] == near * scale
 
 
-@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), SystemExit(1), RuntimeError("x")])
-def test_a_video_that_breaks_off_leaves_the_one_of_before(run: Run, tmp_path: Path, monkeypatch, failure: BaseException):
+@pytest.mark.parametrize(
+    "failure", [OSError(errno.ENOSPC, "No space left on device"), SystemExit(1), RuntimeError("x")]
+)
+def test_a_video_that_breaks_off_leaves_the_one_of_before(
+    run: Run, tmp_path: Path, monkeypatch, failure: BaseException
+):
     class Renderer:
         def __init__(self, output_path: Path, **settings: Any):
             self.output_path = output_path

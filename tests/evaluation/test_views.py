@@ -24,7 +24,7 @@ HELD_OUT = [2, 6, 10]
 
 @pytest.fixture
 def shown(run: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A pipeline whose field shows a wall parallel to every picture, darker to the right and brighter from view to view."""
+    """A pipeline whose field shows a wall parallel to every picture, darker to the right, brighter in each view."""
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     calls = []
 
@@ -163,7 +163,9 @@ def test_a_full_disk_leaves_no_half_of_a_picture(tmp_path: Path, monkeypatch: py
     assert not np.asarray(Image.open(tmp_path / "eval_img_0000.png")).any(), "what is not finite is black"
     before = (tmp_path / "eval_img_0000.png").read_bytes()
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OutputError, match=r"^The folder of pictures .* \(No space left on device\); give another one\.$"):
+    with pytest.raises(
+        OutputError, match=r"^The folder of pictures .* \(No space left on device\); give another one\.$"
+    ):
         save_pictures([view, view], tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["eval_img_0000.png"]
     assert (tmp_path / "eval_img_0000.png").read_bytes() == before
