@@ -116,7 +116,8 @@ class EventRecording:
     held_out_frames: Frames | None = None
     """Views for evaluation alone, on a trajectory and a clock of their own."""
     contrast_thresholds: tuple[float, float] | None = None
-    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`, where the recording knows them."""
+    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`, where the recording knows
+    them."""
     refractory_period: int = 0
     """For how long a pixel is blind after an event, ns; at most 1000 s."""
     bayer_pattern: str | None = None

@@ -128,20 +128,13 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def silent_sampler(self) -> SilentPixelSampler | None:
-        """Draws silent pixels as the config says; None where it wants none.
-
-        Raises:
-            FlagError: The shortest silence is no duration.
-        """
+        """Draws silent pixels as the config says; None where it wants none."""
         if not self.config.silent_pairs:
             return None
         assert self.config.silence_ms is not None
         silence = round(self.config.silence_ms * 1e6)
-        try:
-            span = index_events(self.recording).span
-            return SilentPixelSampler(self.index, *span, silence, silence, self._stretches)
-        except ValueError as error:
-            raise FlagError(f"{self.recording.path}: {error}") from error
+        span = index_events(self.recording).span
+        return SilentPixelSampler(self.index, *span, silence, silence, self._stretches)
 
     @cached_property
     def event_camera(self) -> PosedCamera:

@@ -148,8 +148,8 @@ def _check_order(config: TrainerConfig) -> None:
         warmup, steps = getattr(scheduler, "warmup_steps", 0), scheduler.max_steps or config.max_num_iterations
         if warmup >= steps:
             raise FlagError(
-                f"--optimizers.{group}.scheduler.warmup-steps is {warmup}, but must be below the {steps} steps in which "
-                "the learning rate falls."
+                f"--optimizers.{group}.scheduler.warmup-steps is {warmup}, but must be below the {steps} steps of its "
+                "learning rate."
             )
 
 

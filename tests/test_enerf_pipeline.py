@@ -54,3 +54,24 @@ def test_the_config_of_a_pipeline_has_nothing_open_and_the_users_is_as_it_was(re
     used = made.config
     assert used.model.num_channels == 1 and used.datamanager.dataparser.depth_range is not None
     assert used.model.sensor.contrast_thresholds is not None and used.datamanager.pair_mode == "partner"
+
+
+@pytest.mark.parametrize(
+    ("change", "scores"),
+    [
+        (lambda rgb: rgb, {"psnr", "ssim"}),
+        (lambda rgb: 1.0 - rgb, set()),
+        (lambda rgb: 0.0 * rgb, set()),
+        (lambda rgb: torch.nan * rgb, set()),
+    ],
+    ids=["frame", "negative", "dark", "nan"],
+)
+@pytest.mark.parametrize("depth", [2.0, 0.0, torch.nan, torch.inf])
+def test_a_picture_in_training_has_the_scores_that_it_can_have(pipeline: Any, change: Any, scores: set, depth: float):
+    """As Nerfstudio logs them: numbers alone, and pictures that are finite."""
+    batch = pipeline.datamanager.eval_dataset[0]
+    outputs = {"rgb": change(batch["image"][..., :3]), "depth": torch.full((*batch["image"].shape[:2], 1), depth)}
+    found, images = pipeline.model.get_image_metrics_and_images(outputs, batch)
+    assert set(found) == scores and all(isinstance(score, float) and np.isfinite(score) for score in found.values())
+    assert all(image.isfinite().all() for image in images.values())
+    assert images["depth"].max() == (1.0 if depth == 2.0 else 0.0)

@@ -216,7 +216,7 @@ def test_flags_of_messages_are_those_of_ns_train():
         (
             "scheduler",
             {"warmup_steps": 4000},
-            r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps in",
+            r"^--optimizers\.fields\.scheduler\.warmup-steps is 4000, .* 4000 steps of",
         ),
         ("scheduler", {"warmup_steps": 9, "max_steps": 9}, r"warmup-steps is 9, but must be below the 9 steps"),
         (

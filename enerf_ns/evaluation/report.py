@@ -39,7 +39,7 @@ VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 
 def write_report(
     run: Run, output_dir: Path, extra: Mapping[str, float] | None = None
-) -> dict[str, float | None | NotScored]:
+) -> dict[str, float | NotScored | None]:
     """Render the held-out frames once and write scores.json and side-by-side.png; then camera_path.json and video.mp4.
 
     Args:

@@ -62,7 +62,7 @@ def mean_scores(views: Sequence[HeldOutView], with_std: bool = False) -> tuple[d
 
 def summary_scores(
     views: Sequence[HeldOutView], summary: Mapping[str, Score], with_std: bool = False
-) -> dict[str, float | None | NotScored]:
+) -> dict[str, float | NotScored | None]:
     """Mean scores and the numbers about the whole set in one table, with a place for each score that can be missing.
 
     Args:
@@ -76,7 +76,7 @@ def summary_scores(
         event_correlation stands for them. not_scored, where anything is left out, says what and why.
     """
     means, not_scored = mean_scores(views, with_std)
-    scores: dict[str, float | None | NotScored] = {"psnr": None, "ssim": None, "lpips": None}
+    scores: dict[str, float | NotScored | None] = {"psnr": None, "ssim": None, "lpips": None}
     scores |= means
     depths = [view.recorded_depth[is_known(view.recorded_depth)] for view in views if view.recorded_depth is not None]
     means_of_depth = [float(depth.mean()) for depth in depths if len(depth)]

@@ -9,6 +9,7 @@ import tyro
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor, nn
 
+from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS
 from enerf_ns.sensor.response import ColourFilter, pixel_brightness, response_named
 
 DEFAULT_CONTRAST_THRESHOLD = 0.25
@@ -124,9 +125,10 @@ def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
 
     Over a long recording every pixel's changes nearly cancel, so num_on * C_on = num_off * C_off; the mean of the two,
     which events cannot tell, is `DEFAULT_CONTRAST_THRESHOLD`. A recording without one of the polarities gives equal
-    thresholds.
+    thresholds, and one with hardly any events of it the least threshold, of `CONTRAST_THRESHOLD_LIMITS`, for the other.
     """
     if num_on == 0 or num_off == 0:
         return DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD
-    on = 2.0 * DEFAULT_CONTRAST_THRESHOLD * num_off / (num_on + num_off)
-    return on, 2.0 * DEFAULT_CONTRAST_THRESHOLD - on
+    both, least = 2.0 * DEFAULT_CONTRAST_THRESHOLD, CONTRAST_THRESHOLD_LIMITS[0]
+    on = min(max(both * num_off / (num_on + num_off), least), both - least)
+    return on, both - on

@@ -98,7 +98,7 @@ def test_a_summary_has_a_place_for_what_is_missing():
     assert {name: table[name] for name in means} == means
 
     nothing = [replace(view, recorded=None, recorded_depth=None) for view in views()]
-    reasons = dict.fromkeys(("psnr", "ssim", "correlation", "lpips"), {"there is no frame": [0, 1, 2]})
+    reasons = {name: {"there is no frame": [0, 1, 2]} for name in ("psnr", "ssim", "correlation", "lpips")}
     empty = {"psnr": None, "ssim": None, "lpips": None}
     table = summary_scores(nothing, {"event_correlation": 0.5})
     assert table == {**empty, "event_correlation": 0.5, "not_scored": reasons}

@@ -24,7 +24,7 @@ HELD_OUT = [2, 6, 10]
 
 @pytest.fixture
 def shown(run: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A pipeline whose field shows a wall parallel to every picture, darker to the right and brighter from view to view."""
+    """A pipeline whose field shows a wall parallel to every picture, darker to the right, brighter in each view."""
     scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     calls = []
 

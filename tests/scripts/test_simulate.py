@@ -66,7 +66,7 @@ def test_an_offset_of_the_logarithm_is_short_for_a_response(call):
         (("--response", "linear"), "enerf: --response names the response 'linear', but linlog, or"),
         (("--log-eps", "0"), "enerf: --response names the response 'logarithm:0.0', but linlog, or"),
         (("--log-eps", "0.01", "--response", "linlog"), "enerf: --log-eps 0.01 contradicts --response linlog; leave"),
-        (("--leak-rate", "-1"), "enerf: leak_rate is -1.0, but must be at least 0"),
+        (("--leak-rate", "-1"), "enerf: --leak-rate is -1.0, but must be at least 0"),
     ],
 )
 def test_flags_that_cannot_be_are_told_in_a_sentence(call, flags: tuple[str, ...], sentence: str):

@@ -75,6 +75,11 @@ def test_thresholds_balance_the_polarities():
     assert (on + off) / 2 == pytest.approx(DEFAULT_CONTRAST_THRESHOLD)
 
 
+@pytest.mark.parametrize(("counts", "expected"), [((10**6, 1), (0.001, 0.499)), ((1, 10**6), (0.499, 0.001))])
+def test_thresholds_stay_those_of_a_sensor_however_few_events_one_polarity_has(counts, expected):
+    assert thresholds_from_polarity(*counts) == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("counts", [(0, 0), (7, 0), (0, 7), (7, 7)])
 def test_thresholds_are_equal_where_polarities_are_or_one_is_missing(counts: tuple[int, int]):
     assert thresholds_from_polarity(*counts) == (DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD)

@@ -319,7 +319,7 @@ BAD_INPUT = {
     ),
     "threshold negative": (
         write("esim.conf", "--contrast_threshold_neg=-0.2"),
-        "esim.conf holds the contrast thresholds 1 (of on events) and -0.2 (of off events), but both must be from 0.001 to 10",
+        "esim.conf holds the contrast thresholds 1 (of on events) and -0.2 (of off events), but both must be",
     ),
     "refractory period negative": (
         write("esim.conf", "--refractory_period_ns=-5"),

@@ -507,7 +507,7 @@ BAD_INPUT = {
     ),
     "threshold negative": (
         save(CALIBRATION_FILE, neg_contrast_threshold=-0.25),
-        "holds the contrast thresholds 0.375 (of on events) and -0.25 (of off events), but both must be from 0.001 to 10",
+        "holds the contrast thresholds 0.375 (of on events) and -0.25 (of off events), but both must be from",
     ),
     "threshold NaN": (save(CALIBRATION_FILE, pos_contrast_threshold=np.nan), "thresholds nan (of on events) and 0.25"),
     "threshold text": (save(CALIBRATION_FILE, pos_contrast_threshold="0.2"), "pos_contrast_threshold as <U3 of"),
