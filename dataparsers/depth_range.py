@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -9,6 +11,7 @@ import torch
 from jaxtyping import Float64
 from rich.progress import track
 
+from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.indexing import index_events
@@ -24,8 +27,42 @@ MIN_PEAK = 2.5  # of the dispersion of votes, relative to its median over the pl
 MIN_GAIN = 1.5  # relative to the plane at infinity
 MIN_VOTES = 0.1  # a grid pixel
 
+MAX_SHARE_BY_CHANCE = 0.1
+"""Largest share of the tiles' depths that may be chance; cameras that only turn show 0.2 and more."""
+
 EVENTS_FOR_DEPTH = 4_000_000
 """Number of events that measure the depth of the scene, where there are more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parallax:
+    """What the events of a moving camera show of near and far; its planes behind the camera are the control."""
+
+    depths: Float64[np.ndarray, " tiles"]
+    """Metres, along the optical axis, of all tiles whose votes pile up clearly at one plane."""
+    num_by_chance: int
+    """Tiles whose votes pile up as clearly behind the camera, where nothing is seen: as many of `depths` are wrong."""
+    num_at_infinity: int
+    """Tiles whose votes pile up clearly at infinity, so that the camera's rotation alone explains them."""
+    extent: float
+    """Diagonal of the box around the camera's path, metres."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the depths are more than chance: as in target-decoy tests, 1 is added to what the control found."""
+        return 1 + self.num_by_chance <= MAX_SHARE_BY_CHANCE * len(self.depths)
+
+    @property
+    def is_ruled_out(self) -> bool:
+        """Whether the camera is seen to turn only, or the scene to be far beyond the reach of its motion."""
+        moves = self.extent > 0 and self.num_at_infinity <= len(self.depths) + self.num_by_chance
+        return not self.is_shown and not moves
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """0.7 times the 2nd and 1.4 times the 98th percentile of the depths, metres."""
+        near, far = np.percentile(self.depths, [2, 98])
+        return 0.7 * float(near), 1.4 * float(far)
 
 
 def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -43,70 +80,142 @@ def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | N
     return near, far
 
 
-@cache
 def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
-    """Depth range measured from a recording's events; takes seconds, and is done once for a recording in a process."""
-    events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
-    try:
-        return estimate_depth_range(events, recording.camera, recording.trajectory)
-    except ValueError as error:
+    parallax = recording_parallax(recording)
+    if not parallax.is_shown:
+        found = "the camera only turns: " if parallax.is_ruled_out else ""
         raise RecordingError(
-            f"{recording.path}: {str(error).rstrip('.')}, with --depth-range NEAR FAR of the data parser (metres)."
-        ) from error
+            f"{recording.path}: the depth range of the scene cannot be measured, because {found}its path spans "
+            f"{parallax.extent:.3g} m, and its events show no parallax; state the range with --depth-range NEAR FAR of "
+            "the data parser (metres)."
+        )
+    return parallax.depth_range
 
 
-def estimate_depth_range(events: Events, camera: Camera, trajectory: Trajectory) -> tuple[float, float]:
-    """Near and far bound of the depth (along the optical axis) at which the event camera saw the scene, in metres.
+@cache
+def recording_parallax(recording: EventRecording) -> Parallax:
+    """What a recording's events show of near and far; takes seconds, and is done once for a recording in a process."""
+    return measure_parallax(_some_events(recording), recording.camera, recording.trajectory)
+
+
+@cache
+def share_beyond(recording: EventRecording, depth_range: tuple[float, float]) -> float:
+    """Share of a recording's events that come from beyond a range of depth; takes a second, once in a process.
+
+    Args:
+        recording: Whose camera and trajectory are known.
+        depth_range: Nearest and farthest depth in metres.
+    """
+    return measure_share_beyond(_some_events(recording), recording.camera, recording.trajectory, depth_range)
+
+
+def _some_events(recording: EventRecording) -> Events:
+    events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
+    return events
+
+
+def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> Parallax:
+    """At which depths the event camera saw the scene, and how much of that is chance.
 
     A space sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018): the viewing rays of the events of
     an edge meet where the edge is. Rays from within half a baseline of a reference view are cut by planes parallel to
     its image, evenly spaced in disparity. Where the cuts pile up is told, for each tile of the view, by the dispersion
     (variance over mean) of their counts; the variance is the objective of Gallego et al., "A Unifying Contrast
     Maximization Framework", CVPR 2018. Nothing depends on the unit of length: baselines are the extent of the camera's
-    path and its halvings.
+    path and its halvings. The same planes behind the camera, where rays of a scene never meet, are the control: where
+    there is no parallax, or only noise of the poses, votes pile up there as often as in front.
 
     Args:
         events: In time order, within the span of the trajectory.
         camera: Of the events.
         trajectory: Of that camera.
+    """
+    path = _path(events, trajectory)
+    extent, depths, num_by_chance, num_at_infinity = _extent(path[1]), [np.empty(0)], 0, 0
+    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True)
+    planes = np.concatenate([DISPARITIES, -DISPARITIES])
+    for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
+        ahead, behind = np.split(sweep, 2, axis=1)
+        depths.append(baseline * _focal(camera) / _clear_disparities(*ahead))
+        num_by_chance += len(_clear_disparities(*behind))
+        num_at_infinity += _num_at_infinity(*sweep)
+    return Parallax(np.concatenate(depths), num_by_chance, num_at_infinity, extent)
+
+
+def measure_share_beyond(
+    events: Events, camera: Camera, trajectory: Trajectory, depth_range: tuple[float, float]
+) -> float:
+    """Share of the events, of those whose depth shows, that come from beyond a range of depth; 0 to 1.
+
+    The sweep of `measure_parallax` at the longest baseline at which the nearest depth is within its planes. A tile's
+    events lie beyond where they pile up clearly between the farthest depth and infinity, and more than at any depth
+    of the range; they lie within it where it is the other way round.
+
+    Args:
+        events: In time order, within the span of the trajectory.
+        camera: Of the events.
+        trajectory: Of that camera.
+        depth_range: Nearest and farthest depth, metres.
 
     Returns:
-        0.7 times the 2nd and 1.4 times the 98th percentile of the depths of all tiles where the cuts pile up clearly.
-
-    Raises:
-        ValueError: There are no such tiles: the camera only turns, moves too little, or saw too few events.
+        0 also where the camera moves too little to tell the farthest depth from infinity.
     """
-    depths = np.empty(0)
-    extent = 0.0
-    if len(events):
-        directions = camera.pixel_directions()
-        path_times = np.linspace(events.t[0], events.t[-1], 2000).astype(np.int64)
-        path = trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
-        extent = float(np.linalg.norm(np.ptp(path, axis=0)))
-        generator = np.random.default_rng(0)
-        references = events.t[len(events) // 24 :: len(events) // 12 + 1]
-    if extent > 0:
-        sweeps = []
-        for level in track(range(6), "Measuring the depth of the scene", transient=True):
-            baseline = extent / 2**level
-            for reference in references:
-                chosen = _events_seen_within(baseline / 2, reference, events, path_times, path)
-                if len(chosen) > EVENTS_PER_SWEEP:
-                    chosen = generator.choice(chosen, EVENTS_PER_SWEEP, replace=False)
-                rays, centres = _in_view(
-                    directions[events.y[chosen], events.x[chosen]],
-                    trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
-                    trajectory.poses(torch.as_tensor(reference)).numpy(),
-                )
-                sweeps.append(_sweep(rays, centres / baseline, camera) * baseline)
-        depths = np.concatenate(sweeps)
-    if not len(depths):
-        raise ValueError(
-            f"The depth range of the scene cannot be measured, because the camera's path spans {extent:.3g} m and its "
-            f"{len(events)} events show no parallax: state the range."
-        )
-    near, far = np.percentile(depths, [2, 98])
-    return 0.7 * float(near), 1.4 * float(far)
+    near, far = depth_range
+    path = _path(events, trajectory)
+    baseline = min(_extent(path[1]), LARGEST_DISPARITY * near / _focal(camera))
+    farthest = baseline * _focal(camera) / far
+    within = beyond = 0.0
+    if farthest < SMALLEST_DISPARITY:
+        return 0.0
+    for _, (dispersion, votes) in _sweeps(events, camera, trajectory, path, [baseline], DISPARITIES):
+        best_beyond, best_within = (dispersion[side].max(0) for side in (DISPARITIES < farthest, DISPARITIES >= farthest))
+        clear = (dispersion.max(0) > MIN_PEAK * np.median(dispersion, 0)) & (votes[0] > MIN_VOTES)
+        beyond += votes[0, clear & (best_beyond > MIN_GAIN * best_within)].sum()
+        within += votes[0, clear & (best_within > MIN_GAIN * best_beyond)].sum()
+    return float(beyond / (beyond + within)) if beyond else 0.0
+
+
+def _path(events: Events, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Times (ns) evenly spread over the events, and the places of the camera then (metres); none without events."""
+    if not len(events):
+        return np.empty(0, np.int64), np.empty((0, 3))
+    path_times = np.linspace(events.t[0], events.t[-1], 2000).astype(np.int64)
+    return path_times, trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
+
+
+def _sweeps(
+    events: Events,
+    camera: Camera,
+    trajectory: Trajectory,
+    path: tuple[np.ndarray, np.ndarray],
+    baselines: Iterable[float],
+    disparities: Float64[np.ndarray, " planes"],
+) -> Iterator[tuple[float, Float64[np.ndarray, "2 planes tiles"]]]:
+    """Each baseline (metres) with what `_sweep` found of each of its reference views; none where nothing moves."""
+    if not _extent(path[1]):
+        return
+    directions, generator = camera.pixel_directions(), np.random.default_rng(0)
+    references = events.t[len(events) // 24 :: len(events) // 12 + 1]
+    for baseline in baselines:
+        for reference in references:
+            chosen = _events_seen_within(baseline / 2, reference, events, *path)
+            if len(chosen) > EVENTS_PER_SWEEP:
+                chosen = generator.choice(chosen, EVENTS_PER_SWEEP, replace=False)
+            rays, centres = _in_view(
+                directions[events.y[chosen], events.x[chosen]],
+                trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
+                trajectory.poses(torch.as_tensor(reference)).numpy(),
+            )
+            yield baseline, _sweep(rays, centres / baseline, camera, disparities)
+
+
+def _extent(path: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
+
+
+def _focal(camera: Camera) -> float:
+    """Focal length in grid pixels."""
+    return camera.fx * GRID_WIDTH / camera.width
 
 
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
@@ -135,8 +244,9 @@ def _sweep(
     rays: Float64[np.ndarray, "rays 3"],
     centres: Float64[np.ndarray, "rays 3"],
     camera: Camera,
-) -> Float64[np.ndarray, " tiles"]:
-    """Depths, in baselines, of the tiles of the view whose votes pile up clearly at one plane.
+    disparities: Float64[np.ndarray, " planes"],
+) -> Float64[np.ndarray, "2 planes tiles"]:
+    """Dispersion of the votes, and votes a grid pixel, of each tile of the view at each plane.
 
     A ray a (z = 1) from c meets the plane of depth z at c + (z - c_z) a, which the view sees at a + (c - c_z a) / z.
     """
@@ -144,16 +254,33 @@ def _sweep(
     focal, columns, rows = camera.fx * scale, GRID_WIDTH // TILE, round(camera.height * scale) // TILE
     start = focal * rays[:, :2] + np.array([camera.cx, camera.cy]) * scale
     drift = centres[:, :2] - centres[:, 2:] * rays[:, :2]
-    dispersion = np.zeros((len(DISPARITIES), rows, columns))
-    votes = np.zeros_like(dispersion)
-    for plane, disparity in enumerate(DISPARITIES):
-        x, y = np.rint(start + disparity * drift).astype(np.int64).T
-        inside = (x >= 0) & (x < columns * TILE) & (y >= 0) & (y < rows * TILE)
-        area = (1 - disparity / focal * centres[inside, 2]) ** 2  # so that magnification does not look like focus
-        counts = np.bincount(y[inside] * columns * TILE + x[inside], area, rows * columns * TILE**2)
-        tiles = counts.reshape(rows, TILE, columns, TILE)
-        votes[plane] = tiles.mean((1, 3))
-        dispersion[plane] = tiles.var((1, 3)) / np.maximum(votes[plane], 1e-9)
+    votes, squares = np.zeros((2, len(disparities), rows * columns))
+    approach = np.ascontiguousarray(centres[:, 2]) / focal
+    compiled(_vote)(start, drift, approach, disparities, np.empty((rows * columns, TILE**2)), columns, votes, squares)
+    votes, squares = votes / TILE**2, squares / TILE**2
+    return np.stack([(squares - votes**2) / np.maximum(votes, 1e-9), votes])
+
+
+def _vote(start, drift, approach, disparities, counts, columns, votes, squares):
+    """Adds up, for each plane and tile, the votes of all rays and the squares of the counts of its grid pixels."""
+    for plane, disparity in enumerate(disparities):
+        counts[:] = 0.0
+        for ray in range(len(start)):
+            x = int(np.rint(start[ray, 0] + disparity * drift[ray, 0]))
+            y = int(np.rint(start[ray, 1] + disparity * drift[ray, 1]))
+            tile = y // TILE * columns + x // TILE
+            if 0 <= x < columns * TILE and 0 <= y and tile < len(counts):
+                pixel = y % TILE * TILE + x % TILE
+                area = (1 - disparity * approach[ray]) ** 2  # so that magnification does not look like focus
+                votes[plane, tile] += area
+                squares[plane, tile] += area * (area + 2 * counts[tile, pixel])
+                counts[tile, pixel] += area
+
+
+def _clear_disparities(
+    dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
+) -> Float64[np.ndarray, " clear"]:
+    """Disparities, of DISPARITIES, of the tiles whose votes pile up clearly at one plane."""
     peak = dispersion.argmax(0)[None]
     disparity = DISPARITIES[peak]
     clear = (
@@ -162,4 +289,13 @@ def _sweep(
         & (disparity >= SMALLEST_DISPARITY)
         & (disparity <= LARGEST_DISPARITY)
     )
-    return focal / disparity[clear]
+    return disparity[clear]
+
+
+def _num_at_infinity(
+    dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
+) -> int:
+    """Number of tiles whose votes pile up clearly at infinity, in front and behind."""
+    peak = dispersion.argmax(0)
+    clear = (dispersion.max(0) > MIN_PEAK * np.median(dispersion, 0)) & (votes[0] > MIN_VOTES)
+    return np.count_nonzero(clear & (DISPARITIES[peak % len(DISPARITIES)] < SMALLEST_DISPARITY))
