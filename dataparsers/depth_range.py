@@ -18,7 +18,7 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
 
-GRID_WIDTH = 240  # of the view that votes are cast into, coarse enough for the number of events
+GRID_WIDTH = 240  # at most, of the view that votes are cast into: coarse enough for the number of events
 TILE = 16
 EVENTS_PER_SWEEP = 20_000
 DISPARITIES = np.concatenate([np.arange(0.0, 8.0, 0.5), np.arange(8.0, 65.0)])  # grid pixels
@@ -27,8 +27,14 @@ MIN_PEAK = 2.5  # of the dispersion of votes, relative to its median over the pl
 MIN_GAIN = 1.5  # relative to the plane at infinity
 MIN_VOTES = 0.1  # a grid pixel
 
-MAX_SHARE_BY_CHANCE = 0.1
-"""Largest share of the tiles' depths that may be chance; cameras that only turn show 0.2 and more."""
+FARTHEST_DISPARITY = 8.0
+"""Grid pixels by which the farthest depth of a range should move against infinity, so that the two are told apart."""
+
+MIN_TILES = 20
+"""Fewest tiles with a depth that show parallax; of cameras that only turn, chance makes a dozen look so."""
+
+MIN_CHANCE_RATIO = 3.0
+"""Least ratio of tiles with a depth to tiles that look so by chance; for cameras that only turn it stays below 2."""
 
 EVENTS_FOR_DEPTH = 4_000_000
 """Number of events that measure the depth of the scene, where there are more."""
@@ -49,8 +55,8 @@ class Parallax:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the depths are more than chance: as in target-decoy tests, 1 is added to what the control found."""
-        return 1 + self.num_by_chance <= MAX_SHARE_BY_CHANCE * len(self.depths)
+        """Whether there are more depths than chance explains."""
+        return len(self.depths) > MIN_TILES + MIN_CHANCE_RATIO * self.num_by_chance
 
     @property
     def is_ruled_out(self) -> bool:
@@ -95,23 +101,18 @@ def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
 @cache
 def recording_parallax(recording: EventRecording) -> Parallax:
     """What a recording's events show of near and far; takes seconds, and is done once for a recording in a process."""
-    return measure_parallax(_some_events(recording), recording.camera, recording.trajectory)
+    events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
+    return measure_parallax(events, recording.camera, recording.trajectory)
 
 
 @cache
 def share_beyond(recording: EventRecording, depth_range: tuple[float, float]) -> float:
-    """Share of a recording's events that come from beyond a range of depth; takes a second, once in a process.
+    """Share of a recording's events that come from beyond a range of depth (nearest, farthest; metres), 0 to 1.
 
-    Args:
-        recording: Whose camera and trajectory are known.
-        depth_range: Nearest and farthest depth in metres.
+    See `measure_share_beyond`; it takes a second, and is done once for a recording and a range in a process.
     """
-    return measure_share_beyond(_some_events(recording), recording.camera, recording.trajectory, depth_range)
-
-
-def _some_events(recording: EventRecording) -> Events:
     events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
-    return events
+    return measure_share_beyond(events, recording.camera, recording.trajectory, depth_range)
 
 
 def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> Parallax:
@@ -145,11 +146,11 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
 def measure_share_beyond(
     events: Events, camera: Camera, trajectory: Trajectory, depth_range: tuple[float, float]
 ) -> float:
-    """Share of the events, of those whose depth shows, that come from beyond a range of depth; 0 to 1.
+    """Share of the events that no depth of a range explains, since they come from beyond it; 0 to 1.
 
-    The sweep of `measure_parallax` at the longest baseline at which the nearest depth is within its planes. A tile's
-    events lie beyond where they pile up clearly between the farthest depth and infinity, and more than at any depth
-    of the range; they lie within it where it is the other way round.
+    The sweep of `measure_parallax`, at one baseline, at which the farthest depth lies FARTHEST_DISPARITY from infinity.
+    A tile's votes lie beyond where they pile up more at some plane between the farthest depth and infinity than at all
+    planes of the range; ties of noise go to the range, which has more planes.
 
     Args:
         events: In time order, within the span of the trajectory.
@@ -161,18 +162,20 @@ def measure_share_beyond(
         0 also where the camera moves too little to tell the farthest depth from infinity.
     """
     near, far = depth_range
-    path = _path(events, trajectory)
-    baseline = min(_extent(path[1]), LARGEST_DISPARITY * near / _focal(camera))
-    farthest = baseline * _focal(camera) / far
-    within = beyond = 0.0
+    path, focal = _path(events, trajectory), _focal(camera)
+    baseline = min(_extent(path[1]), FARTHEST_DISPARITY * far / focal)
+    farthest = baseline * focal / far
     if farthest < SMALLEST_DISPARITY:
         return 0.0
-    for _, (dispersion, votes) in _sweeps(events, camera, trajectory, path, [baseline], DISPARITIES):
-        best_beyond, best_within = (dispersion[side].max(0) for side in (DISPARITIES < farthest, DISPARITIES >= farthest))
-        clear = (dispersion.max(0) > MIN_PEAK * np.median(dispersion, 0)) & (votes[0] > MIN_VOTES)
-        beyond += votes[0, clear & (best_beyond > MIN_GAIN * best_within)].sum()
-        within += votes[0, clear & (best_within > MIN_GAIN * best_beyond)].sum()
-    return float(beyond / (beyond + within)) if beyond else 0.0
+    nearest = min(baseline * focal / near, GRID_WIDTH)
+    planes = np.append(np.arange(0.0, FARTHEST_DISPARITY, 0.5), np.arange(FARTHEST_DISPARITY, nearest + 1))
+    votes_beyond = votes_of_all = 0.0
+    for _, (dispersion, votes) in _sweeps(events, camera, trajectory, path, [baseline], planes):
+        enough = votes[0] > MIN_VOTES
+        beyond = dispersion[planes < farthest].max(0) > dispersion[planes >= farthest].max(0)
+        votes_beyond += votes[0, enough & beyond].sum()
+        votes_of_all += votes[0, enough].sum()
+    return float(votes_beyond / votes_of_all) if votes_of_all else 0.0
 
 
 def _path(events: Events, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -215,7 +218,12 @@ def _extent(path: np.ndarray) -> float:
 
 def _focal(camera: Camera) -> float:
     """Focal length in grid pixels."""
-    return camera.fx * GRID_WIDTH / camera.width
+    return camera.fx * _grid_scale(camera)
+
+
+def _grid_scale(camera: Camera) -> float:
+    """Grid pixels a pixel; a grid finer than the sensor would show the sensor's own pixels as a pattern."""
+    return min(GRID_WIDTH / camera.width, 1.0)
 
 
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
@@ -250,8 +258,8 @@ def _sweep(
 
     A ray a (z = 1) from c meets the plane of depth z at c + (z - c_z) a, which the view sees at a + (c - c_z a) / z.
     """
-    scale = GRID_WIDTH / camera.width
-    focal, columns, rows = camera.fx * scale, GRID_WIDTH // TILE, round(camera.height * scale) // TILE
+    scale, focal = _grid_scale(camera), _focal(camera)
+    columns, rows = (round(side * scale) // TILE for side in (camera.width, camera.height))
     start = focal * rays[:, :2] + np.array([camera.cx, camera.cy]) * scale
     drift = centres[:, :2] - centres[:, 2:] * rays[:, :2]
     votes, squares = np.zeros((2, len(disparities), rows * columns))
