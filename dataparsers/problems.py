@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int64
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.depth_range import recording_parallax
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import read_json
 from enerf_ns.dataparsers.indexing import index_events
@@ -172,7 +173,7 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
 
 
 def find_problems(recording: EventRecording, depth_range: tuple[float, float] | None = None) -> list[Problem]:
-    """What is wrong with a recording, and what to do about it; in less than a second once the events are indexed.
+    """What is wrong with a recording, and what to do about it; in seconds, once the events are indexed.
 
     Args:
         recording: Its index is made if it is not there yet.
@@ -305,11 +306,19 @@ def _distance_problems(
 ) -> Iterator[Problem]:
     extent = _extent(recording, statistics)
     nearest = depth_range[0] if depth_range else ASSUMED_NEAREST
-    parallax = recording.camera.fx * extent / nearest
-    if parallax < MIN_PARALLAX:
+    shift = recording.camera.fx * extent / nearest
+    found = None
+    if shift < MIN_PARALLAX:
+        found = f"its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by {shift:.1f} pixels"
+    elif (parallax := recording_parallax(recording)).is_ruled_out:
+        found = (
+            f"its events pile up {_times(parallax.num_at_infinity)} where its rotation alone puts them, "
+            f"{_times(len(parallax.depths))} at a depth in front of it, and {_times(parallax.num_by_chance)} behind it, "
+            "which is chance"
+        )
+    if found:
         yield Problem(
-            f"The camera only turns: its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by "
-            f"{parallax:.1f} pixels.",
+            f"The camera only turns: {found}.",
             "Nothing tells near from far; move the camera sideways, and check that its positions are in metres.",
         )
     if extent > MAX_EXTENT:
