@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import measure_parallax, measure_share_beyond, scene_depth_range
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
@@ -16,49 +14,17 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.dataparsers.trajectory import Trajectory
-
-CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
-PHASE = 2 * np.pi * np.linspace(0, 1, 2000)[:, None]
-
-
-def recording_of_points(points: np.ndarray, positions: np.ndarray, rotations: Rotation):
-    """Events of points (world, metres), one whenever a point enters a pixel, and the depths at which they were seen.
-
-    A tenth as many events are added at random. A pose is given each millisecond.
-    """
-    times = np.arange(len(positions)) * 1_000_000
-    seen = np.einsum("tji,tnj->tni", rotations.as_matrix(), points - positions[:, None])
-    x, y = np.rint(150 * seen[..., 0] / seen[..., 2] + 79.5), np.rint(150 * seen[..., 1] / seen[..., 2] + 59.5)
-    moved = np.zeros(x.shape, bool)
-    moved[1:] = (np.diff(x, axis=0) != 0) | (np.diff(y, axis=0) != 0)
-    step, point = np.nonzero(moved & (x >= 0) & (x < 160) & (y >= 0) & (y < 120) & (seen[..., 2] > 0.05))
-    x, y, depths = x[step, point], y[step, point], seen[step, point, 2]
-
-    generator = np.random.default_rng(0)
-    noise = len(step) // 10
-    step = np.append(step, generator.integers(0, len(times), noise))
-    x = np.append(x, generator.integers(0, 160, noise)).astype(np.uint16)
-    y = np.append(y, generator.integers(0, 120, noise)).astype(np.uint16)
-    order = np.argsort(step, kind="stable")
-    events = Events(x[order], y[order], times[step[order]], np.ones(len(step), np.int8))
-    return events, Trajectory(times, positions, rotations.as_quat()), depths
-
-
-def points_between(near: float, far: float) -> np.ndarray:
-    """250 points in front of the origin, their depths evenly spread over the octaves."""
-    generator = np.random.default_rng(1)
-    depths = np.exp(generator.uniform(np.log(near), np.log(far), (250, 1)))
-    return depths * np.append(generator.uniform(-0.6, 0.6, (250, 2)), np.ones((250, 1)), axis=1)
-
-
-def shaking(amplitude: float) -> np.ndarray:
-    return amplitude * np.concatenate([np.sin(3 * PHASE), np.sin(2 * PHASE + 1), np.sin(2.5 * PHASE + 3)], axis=1)
-
+from enerf_ns.numerics.points import (
+    CAMERA,
+    PHASE,
+    TURNING,
+    noisy,
+    points_between,
+    recording_of_points,
+    shaking,
+)
 
 STILL = Rotation.from_rotvec(np.zeros((2000, 3)))
-TURNING = Rotation.from_rotvec(
-    0.06 * np.concatenate([np.sin(2 * PHASE), np.sin(3 * PHASE + 2), np.sin(PHASE + 4)], axis=1)
-)
 
 
 @pytest.mark.parametrize(
@@ -116,14 +82,6 @@ def test_an_orbit_around_a_ball():
     near, far = parallax.depth_range
     assert parallax.is_shown
     assert 1.0 < near < depths.min() and depths.max() < far < 8.0
-
-
-def noisy(positions: np.ndarray, noise: float, kind: str, seed: int) -> np.ndarray:
-    """Positions with noise of a standard deviation in metres: white, or drifting over a fifth of the recording."""
-    errors = np.random.default_rng(seed).normal(size=positions.shape)
-    if kind == "drift":
-        errors = gaussian_filter1d(errors, len(errors) / 5, axis=0)
-    return positions + noise * errors / errors.std()
 
 
 @pytest.mark.parametrize("kind", ["white", "drift"])
