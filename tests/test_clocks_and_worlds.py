@@ -74,6 +74,7 @@ def test_the_clock_changes_nothing_but_stamps(on_clocks, tmp_path: Path) -> None
         whole = read_recording(folder)
         assert whole.trajectory.start == (0 if layout == "davis" else zero)  # whose reader starts the clock again
         zero = whole.trajectory.start
+        assert whole.frames is not None
         found = Inspection.of(whole)
         problems = [problem.what.replace(str(folder), "") for problem in found.problems]
         assert "<img" in found.page()
