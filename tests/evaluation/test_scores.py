@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,7 +84,8 @@ def test_means_are_over_the_frames_that_have_a_score_and_the_others_are_named():
     sound = views(5)
     left = {"psnr": [0, 1, 3, 4], "ssim": [0, 1, 3, 4], "correlation": [0, 1, 4], "depth_rmse": [0, 2]}
     for name, frames in left.items():
-        assert table[name] == pytest.approx(np.mean([view_scores(sound[frame])[name] for frame in frames]))
+        values: list[Any] = [view_scores(sound[frame])[name] for frame in frames]
+        assert table[name] == pytest.approx(np.mean(values))
     depths = [sound[frame].recorded_depth for frame in (0, 2, 3)]
     assert table["mean_depth"] == pytest.approx(np.mean([d[d > 0].mean().item() for d in depths if d is not None]))
     assert json.loads(json.dumps(table, allow_nan=False)) == table

@@ -66,7 +66,9 @@ def test_all_numbers_are_found():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1, 1e300])
 def test_numbers_that_no_setting_takes_are_refused_by_flag(kind: type, name: str, value: float):
     changes: Any = {name: (0.2, value) if NUMBERS[kind, name] else value}
-    part = {SensorSettings: "sensor", FrameSettings: "frame"}.get(kind)
+    part = "sensor" if kind is SensorSettings else "frame" if kind is FrameSettings else None
     flag = "--" + ("frame." if kind is FrameSettings else "") + name.replace("_", "-")
     with pytest.raises(FlagError, match=rf"^{flag} is .*, but must be .*\.$"):
-        resolve(SimulationSettings("shapes", **({part: kind(**changes)} if part else changes)))
+        if part is not None:
+            changes = {part: kind(**changes)}
+        resolve(SimulationSettings("shapes", **changes))

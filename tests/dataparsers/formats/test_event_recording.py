@@ -414,7 +414,7 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     "one threshold": ({"contrast_thresholds": 0.2}, "contrast_thresholds = 0.2, but two numbers above 0"),
     "threshold of no sensor": (
         {"contrast_thresholds": [1e-45, 1e-45]},
-        "holds the contrast thresholds 1e-45 (of on events) and 1e-45 (of off events), but both must be from 0.001 to 10",
+        "holds the contrast thresholds 1e-45 (of on events) and 1e-45 (of off events), but both must be from 0.001",
     ),
     "threshold 0": ({"contrast_thresholds": [0.2, 0]}, "the contrast thresholds 0.2 (of on events) and 0 ("),
     "far before near": ({"depth_range": [4, 1]}, "the range of depth 4 m to 1 m, but the nearest and"),
