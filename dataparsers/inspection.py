@@ -19,7 +19,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.depth_range import scene_depth_range
+from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.files import load_image
@@ -165,9 +165,10 @@ class Inspection:
             _, scale, box = scene_normalisation(recording, near, far)
             sides = " x ".join(f"{side:.3g}" for side in (box[1] - box[0]) / scale)
             rows["near and far"] = f"{near:.3g} m and {far:.3g} m, {source}"
+            rows["beyond"] = f"{100 * share_beyond(recording, self.depth_range):.2g} % of the events"
             rows["box"] = f"{sides} m, all that the camera sees; 1 m is {scale:.3g} in Nerfstudio"
         else:
-            rows["near and far"] = rows["box"] = "unknown"
+            rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
         return rows
 
     def page(self) -> str:
