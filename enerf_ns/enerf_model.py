@@ -16,7 +16,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
-from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
@@ -24,10 +24,13 @@ from torch.nn import Parameter
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, image_metrics
 from enerf_ns.events.batch import TrainBatch
-from enerf_ns.ray_samplers import PairedPDFSampler, PairedUniformSampler, paired_rand
+from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.event_supervision import EventSupervision
 from enerf_ns.supervision.losses import frame_loss
+
+FARTHEST = 1000.0
+"""Where rays end that go on beyond the box, in scene units: halves of its longest side."""
 
 
 @dataclass
@@ -82,6 +85,8 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
     interlevel_loss_weight: float = 1.0
     """Weight of the loss by which the proposal network learns."""
+    contraction: bool = False
+    """Contract the space beyond the box towards infinity, as mip-NeRF 360 does; without it nothing lies there."""
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
 
@@ -125,7 +130,10 @@ class EnerfModel(Model):
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
         aabb = self.scene_box.aabb
-        self.collider = BoxCollider(self.scene_box, config.near_plane)
+        if config.contraction:
+            self.collider = NearFarCollider(config.near_plane, FARTHEST, reset_near_plane=False)
+        else:
+            self.collider = BoxCollider(self.scene_box, config.near_plane)
         self.field = EnerfField(
             aabb,
             num_channels=config.num_channels,
@@ -138,24 +146,32 @@ class EnerfModel(Model):
             max_res=config.max_res,
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
+            contraction=config.contraction,
         )
+        first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
         self.proposal = None
         if config.sampling == "proposal":
             # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
             # thirtieth (float16) of what their jitter does
             self.proposal = HashDensity(
-                aabb, num_levels=5, min_res=16, max_res=max(16, config.max_res // 2), log2_table_size=15, hidden_dim=16
+                aabb,
+                num_levels=5,
+                min_res=16,
+                max_res=max(16, config.max_res // 2),
+                log2_table_size=15,
+                hidden_dim=16,
+                contraction=config.contraction,
             )
             self.sampler = ProposalNetworkSampler(
                 num_proposal_samples_per_ray=(config.num_proposal_samples,),
                 num_nerf_samples_per_ray=config.num_samples,
                 num_proposal_network_iterations=1,
-                initial_sampler=PairedUniformSampler(single_jitter=True),
+                initial_sampler=first_sampler(single_jitter=True),
                 pdf_sampler=PairedPDFSampler(single_jitter=True),
                 update_sched=lambda step: 1 if step > 500 else 0,
             )
         else:
-            self.sampler = PairedUniformSampler(num_samples=config.num_samples)
+            self.sampler = first_sampler(num_samples=config.num_samples)
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
@@ -276,11 +292,14 @@ class EnerfModel(Model):
             align = align_channels if self.sensor.colour_filter else align_brightness
             rendered = align([rendered], [recorded])[0][0]
             scores = image_metrics(rendered, recorded)
-        images = {"img": torch.cat([recorded, rendered], dim=1), "depth": outputs["depth"] / outputs["depth"].max().clamp(min=1e-9)}
+        images = {
+            "img": torch.cat([recorded, rendered], dim=1),
+            "depth": outputs["depth"] / outputs["depth"].max().clamp(min=1e-9),
+        }
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What the viewer and ns-render show of a camera: brightness above 1 is white, where theirs would wrap round."""
+        """What the viewer and ns-render show of a camera: above 1 brightness is white, where it would wrap round."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
         return outputs | {"rgb": outputs["rgb"].clamp(max=1.0)}
 
