@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from enerf_ns.dataparsers.depth_range import scene_depth_range
+from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig
 from enerf_ns.dataparsers.files import load_image
@@ -59,6 +59,9 @@ MOST_LEVELS = 10
 
 SMALLEST_GROWTH = 1.4
 """Least factor by which a level of the hash grid is finer than the one before; closer ones hold nearly the same."""
+
+SHARE_BEYOND = 0.05
+"""Share of the events from beyond the box above which there is space there."""
 
 SEEN_AROUND = math.radians(30)
 """Angle (rad) over which the middle of the scene must be seen before gloss is looked for: within less, what gloss adds
@@ -416,6 +419,12 @@ class _Resolver:
             value, why = f"cube of {2 * box[3]:g} m", self.why(name, "")
         self.row("box", True, value, why, name)
         self.use("model.near_plane", lambda: near * scale)
+
+        name = "model.contraction"
+        share = 0.0 if box is not None else share_beyond(recording, (near, far))
+        contracted = self.use(name, lambda: share > SHARE_BEYOND)
+        why = "the box is set" if box is not None else f"{100 * share:.1f} % of the events come from beyond {far:.3g} m"
+        self.row("contraction", contracted, "space beyond the box" * contracted, self.why(name, why), name)
 
         footprint = math.sqrt(near * far) / recording.camera.fx * scale
         finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))

@@ -106,6 +106,7 @@ enerf_paper = MethodSpecification(
                 hidden_dim_colour=64,
                 view_direction=True,
                 brightness="sigmoid",
+                contraction=False,
                 sampling="uniform",
                 num_samples=512,
                 frame_loss_weight=25.0,  # 1 / C^2 at the paper's C = 0.2: its weight of 1, since event losses count C

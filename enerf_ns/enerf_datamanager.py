@@ -40,6 +40,9 @@ EventDataParserUnion = OmitSubcommandPrefixes[
     )
 ]
 
+DIRECTIONS_NORM = "directions_norm"
+"""Name that Nerfstudio has among the metadata of rays for the length along each of one unit along the optical axis."""
+
 
 @dataclass
 class EnerfDataManagerConfig(VanillaDataManagerConfig):
@@ -163,12 +166,11 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         config, events, frames = self.config, None, None
         if "events" in config.supervision:
             assert config.event_pairs is not None
-            batches = [self.pair_sampler.sample(config.event_pairs, self.generator)]
+            events = self.pair_sampler.sample(config.event_pairs, self.generator)
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)
-                batches.append(silent)
-            events = EventBatch.joined(batches)
+                events = EventBatch.joined([events, silent])
         if "frames" in config.supervision:
             assert config.train_num_rays_per_batch is not None
             indices = self._frame_pixels(config.train_num_rays_per_batch)
@@ -184,13 +186,16 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             bundles.append(self._frame_rays(batch.frames.indices))
 
         def join(name: str) -> Tensor:
-            return torch.cat([getattr(bundle, name) for bundle in bundles])
+            columns = [
+                bundle.metadata[name] if name == DIRECTIONS_NORM else getattr(bundle, name) for bundle in bundles
+            ]
+            return torch.cat(columns) if len(columns) > 1 else columns[0]
 
         return PairedRayBundle(
             origins=join("origins"),
             directions=join("directions"),
             pixel_area=join("pixel_area"),
-            metadata={"directions_norm": torch.cat([bundle.metadata["directions_norm"] for bundle in bundles])},
+            metadata={DIRECTIONS_NORM: join(DIRECTIONS_NORM)},
             num_pairs=batch.num_pairs,
         )
 

@@ -28,7 +28,7 @@ brightness is logarithmic."""
 
 LOG_SIGMOID_RANGE = 4.0
 """Largest range of log brightness for which log-sigmoid is meant. Fitted to pictures of a range of 4 its rms error is
-0.001, of 6 it is 0.08, of 10 0.95, since it spans 5.24 by `linlog`; the exponential's is 0.05 at 10."""
+0.001, of 6 it is 0.08, of 10 0.95, since it spans 5.24 by `linlog`; the exponential's is 0.064 at 10."""
 
 LARGEST_EXPONENT = 30.0
 """Largest exponent of `limited_exp`: far above what training arrives at, and small enough that whatever is made of its
@@ -76,6 +76,8 @@ class HashDensity(nn.Module):
 
     Args:
         aabb: Box in scene units, shape (2, 3). Outside it density is zero.
+        contraction: Reach beyond the box, which lies within [-1, 1], to infinity (mip-NeRF 360, Barron et al., CVPR
+            2022).
         num_features: Outputs beside the density.
         init_density: Density before training, in 1 / scene unit; small, so that training starts without fog.
     """
@@ -89,6 +91,7 @@ class HashDensity(nn.Module):
         max_res: int,
         log2_table_size: int,
         hidden_dim: int,
+        contraction: bool = False,
         num_features: int = 0,
         init_density: float = 0.01,
     ):
@@ -96,7 +99,13 @@ class HashDensity(nn.Module):
         self.register_buffer("aabb", aabb.clone().float())
         self.aabb: Tensor
         self.init_density = init_density
-        self.grid = HashGrid(num_levels, min_res, max_res, log2_table_size)
+        self.contraction = None
+        if contraction:
+            from nerfstudio.field_components.spatial_distortions import SceneContraction
+
+            self.contraction = SceneContraction(order=math.inf)
+        # contracted space is twice as wide as what lies within [-1, 1], which keeps its cells
+        self.grid = HashGrid(num_levels, min_res, 2 * max_res if contraction else max_res, log2_table_size)
         self.network = MLP(
             in_dim=self.grid.out_dim,
             num_layers=2,
@@ -108,6 +117,9 @@ class HashDensity(nn.Module):
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
         """Density in 1 / scene unit, and the features."""
+        if self.contraction is not None:
+            output = self.network(self.grid(0.5 + 0.25 * self.contraction(positions)))
+            return self.init_density * limited_exp(output[..., :1].float()), output[..., 1:]
         unit = SceneBox.get_normalized_positions(positions, self.aabb)
         inside = ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
         output = self.network(self.grid(unit.clamp(0.0, 1.0)))
@@ -143,7 +155,7 @@ class EnerfField(Field):
         **density,
     ):
         super().__init__()
-        self.brightness = brightness
+        self.brightness: Brightness = brightness
         self.geometry = HashDensity(aabb, num_features=num_features, **density)
         self.direction_encoding = SHEncoding(levels=4, implementation="torch") if view_direction else None
         directions = self.direction_encoding.get_out_dim() if self.direction_encoding else 0

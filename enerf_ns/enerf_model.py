@@ -16,7 +16,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
-from nerfstudio.model_components.scene_colliders import AABBBoxCollider
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
@@ -24,10 +24,13 @@ from torch.nn import Parameter
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import align_brightness, align_channels, fit_fault, image_metrics
 from enerf_ns.events.batch import TrainBatch
-from enerf_ns.ray_samplers import PairedPDFSampler, PairedUniformSampler, paired_rand
+from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.event_supervision import EventSupervision
 from enerf_ns.supervision.losses import frame_loss
+
+FARTHEST = 1000.0
+"""Where rays end that go on beyond the box, in scene units: halves of its longest side."""
 
 
 @dataclass
@@ -85,6 +88,9 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
     interlevel_loss_weight: float = 1.0
     """Weight of the loss by which the proposal network learns."""
+    contraction: Optional[bool] = None  # noqa: UP045
+    """Contract the space beyond the box towards infinity, as mip-NeRF 360 does; without it nothing lies there. None:
+    where a share of the events comes from beyond the box."""
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
 
@@ -122,6 +128,7 @@ class EnerfModel(Model):
         super().populate_modules()
         config = self.config
         assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
+        assert config.contraction is not None
         assert (
             config.sampling
             and config.brightness
@@ -134,7 +141,10 @@ class EnerfModel(Model):
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
         aabb = self.scene_box.aabb
-        self.collider = BoxCollider(self.scene_box, config.near_plane)
+        if config.contraction:
+            self.collider = NearFarCollider(config.near_plane, FARTHEST, reset_near_plane=False)
+        else:
+            self.collider = BoxCollider(self.scene_box, config.near_plane)
         self.field = EnerfField(
             aabb,
             num_channels=config.num_channels,
@@ -147,24 +157,32 @@ class EnerfModel(Model):
             max_res=config.max_res,
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
+            contraction=config.contraction,
         )
+        first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
         self.proposal = None
         if config.sampling == "proposal":
             # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
             # thirtieth (float16) of what their jitter does
             self.proposal = HashDensity(
-                aabb, num_levels=5, min_res=16, max_res=max(16, config.max_res // 2), log2_table_size=15, hidden_dim=16
+                aabb,
+                num_levels=5,
+                min_res=16,
+                max_res=max(16, config.max_res // 2),
+                log2_table_size=15,
+                hidden_dim=16,
+                contraction=config.contraction,
             )
             self.sampler = ProposalNetworkSampler(
                 num_proposal_samples_per_ray=(config.num_proposal_samples,),
                 num_nerf_samples_per_ray=config.num_samples,
                 num_proposal_network_iterations=1,
-                initial_sampler=PairedUniformSampler(single_jitter=True),
+                initial_sampler=first_sampler(single_jitter=True),
                 pdf_sampler=PairedPDFSampler(single_jitter=True),
                 update_sched=lambda step: 1 if step > 500 else 0,
             )
         else:
-            self.sampler = PairedUniformSampler(num_samples=config.num_samples)
+            self.sampler = first_sampler(num_samples=config.num_samples)
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
@@ -194,9 +212,9 @@ class EnerfModel(Model):
             ray_bundle: Any rays; in training usually a `PairedRayBundle`.
 
         Returns:
-            rgb (rays, 3), at most 1 but where brightness is exponential, depth (rays, 1) in scene units along the ray,
-            accumulation (rays, 1) and, outside training, normals (rays, 3) mapped from [-1, 1] to [0, 1]. In training
-            also what the losses need.
+            rgb (rays, 3), at most 1 but where brightness is exponential, and accumulation (rays, 1). In training rgb
+            has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in scene
+            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1].
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
@@ -210,17 +228,17 @@ class EnerfModel(Model):
         rgb = field_outputs[FieldHeadNames.RGB]
         background = paired_rand(ray_bundle, 1) if self.training else torch.zeros_like(accumulation)
         colour = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
-        outputs = {"rgb": colour.expand(-1, 3), "accumulation": accumulation}
-        with torch.no_grad():
-            outputs["depth"] = self.renderer_depth(weights=weights, ray_samples=samples)
         if self.training:
-            outputs |= {
+            return {
+                "rgb": colour,
+                "accumulation": accumulation,
                 "weights_list": [*weights_list, weights],
                 "ray_samples_list": [*samples_list, samples],
             }
-        else:
-            outputs["normals"] = self.normals(ray_bundle.origins + ray_bundle.directions * outputs["depth"])
-        return outputs
+        with torch.no_grad():
+            depth = self.renderer_depth(weights=weights, ray_samples=samples)
+            normals = self.normals(ray_bundle.origins + ray_bundle.directions * depth)
+        return {"rgb": colour.expand(-1, 3), "accumulation": accumulation, "depth": depth, "normals": normals}
 
     @torch.no_grad()
     def normals(self, points: Tensor) -> Tensor:
@@ -299,7 +317,7 @@ class EnerfModel(Model):
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What the viewer and ns-render show of a camera: brightness above 1 is white, where theirs would wrap round."""
+        """What the viewer and ns-render show of a camera: above 1 brightness is white, where it would wrap round."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
         return outputs | {"rgb": outputs["rgb"].clamp(max=1.0)}
 

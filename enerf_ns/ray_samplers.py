@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import PDFSampler, UniformSampler
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    SpacedSampler,
+    UniformLinDispPiecewiseSampler,
+    UniformSampler,
+)
 from torch import Tensor
 
 
@@ -30,8 +35,8 @@ def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
     return torch.cat([drawn[:pairs], drawn]) if pairs else drawn
 
 
-class PairedUniformSampler(UniformSampler):
-    """Nerfstudio's UniformSampler; in training, both rays of a pair get the same jitter."""
+class PairedSpacedSampler(SpacedSampler):
+    """One of Nerfstudio's samplers that need no weights; in training, both rays of a pair get the same jitter."""
 
     def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
         """Samples evenly spaced between near and far end, each moved at random within its stretch in training.
@@ -44,13 +49,22 @@ class PairedUniformSampler(UniformSampler):
             return super().generate_ray_samples(ray_bundle, num_samples)
         num_samples = num_samples or self.num_samples
         assert ray_bundle is not None and num_samples is not None
-        near, far = ray_bundle.nears, ray_bundle.fars
-        assert near is not None and far is not None
+        assert ray_bundle.nears is not None and ray_bundle.fars is not None
+        near, far = self.spacing_fn(ray_bundle.nears), self.spacing_fn(ray_bundle.fars)
         edges = torch.linspace(0.0, 1.0, num_samples + 1, device=near.device)[None]
         middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
         lower, upper = torch.cat([edges[:, :1], middles], -1), torch.cat([middles, edges[:, -1:]], -1)
         jitter = paired_rand(ray_bundle, 1 if self.single_jitter else num_samples + 1)
-        return _samples(ray_bundle, lower + (upper - lower) * jitter, lambda x: x * far + (1 - x) * near)
+        bins = lower + (upper - lower) * jitter
+        return _samples(ray_bundle, bins, lambda x: self.spacing_fn_inv(x * far + (1 - x) * near))
+
+
+class PairedUniformSampler(PairedSpacedSampler, UniformSampler):
+    """Even in distance."""
+
+
+class PairedPiecewiseSampler(PairedSpacedSampler, UniformLinDispPiecewiseSampler):
+    """Even in distance up to 1, and then in its inverse."""
 
 
 class PairedPDFSampler(PDFSampler):

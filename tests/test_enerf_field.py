@@ -103,13 +103,13 @@ def weights_of(density: torch.Tensor, length: float) -> torch.Tensor:
 @pytest.mark.parametrize("logit", [-1e4, 88.8, 1e4, 1e30])
 def test_density_is_finite_inside_and_outside_of_the_box_and_an_excess_of_it_can_be_undone(logit: float):
     made = HashDensity(AABB, **GRID)
-    bias = made.network.layers[-1].bias
+    bias: Any = made.network.layers[-1].bias
     with torch.no_grad():
         bias[0] = logit
     density = made.density_fn(torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]))
     density.sum().backward()
     assert density.isfinite().all() and density[1] == 0
-    assert all(parameter.grad.isfinite().all() for parameter in made.parameters())
+    assert all(parameter.grad is not None and parameter.grad.isfinite().all() for parameter in made.parameters())
     assert bias.grad[0] > 0
 
 
@@ -131,6 +131,20 @@ def test_only_the_exponential_reaches_a_log_range_of_ten(
         optimizer.step()
     error = response(brightness_of(outputs.detach(), brightness)) - expected
     assert least <= error.std().item() <= most
+
+
+def test_with_contraction_there_may_be_something_at_any_distance():
+    """Everywhere finite; what is seen in one direction from twice as far is another point; no parameter is added."""
+    torch.manual_seed(0)
+    made, bounded = HashDensity(AABB / 2, **GRID, contraction=True), HashDensity(AABB / 2, **GRID)
+    torch.nn.init.normal_(made.grid.table)
+    distances = torch.tensor([0.0, 0.5, 0.99, 1.01, 3.0, 6.0, 1e3, 1e30])
+    density = made.density_fn(distances[:, None] * torch.tensor([0.3, -1.0, 0.4]))
+    assert density.isfinite().all() and (density > 0).all()
+    assert len(density[:6].unique()) == 6
+    assert {name: value.shape for name, value in made.state_dict().items()} == {
+        name: value.shape for name, value in bounded.state_dict().items()
+    }
 
 
 @pytest.mark.parametrize("view_direction", [False, True])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from small_runs import set_up, small_config
+from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
@@ -142,7 +142,7 @@ def test_under_autocast_only_the_proposal_network_is_half(pipeline: Any, dtype: 
         pipeline.zero_grad()
         with torch.autocast("cpu", dtype=dtype, enabled=half):
             outputs, losses, metrics = pipeline.get_train_loss_dict(0)
-        sum(losses.values()).backward()
+        torch.stack(list(losses.values())).sum().backward()
         assert all(value.dtype == torch.float32 for value in (losses | metrics).values())
         assert all(output.dtype == torch.float32 for output in (outputs["rgb"], *outputs["weights_list"]))
         start, end = outputs["rgb"].detach()[: 2 * manager.config.event_pairs].chunk(2)
@@ -172,6 +172,18 @@ def test_brightness_above_white_is_scored_as_it_is_and_shown_as_white(recording:
     scored = held_out_views(pipeline)[0][0].unaligned
     assert scored.isfinite().all() and (scored > 1).any()
     torch.testing.assert_close(shown, scored.clamp(max=1.0))
+
+
+def test_with_contraction_what_lies_beyond_the_box_is_learnt(recording: Path, tmp_path: Path):
+    """By all parameters, and seen by rays that miss the box."""
+    config = small_config(recording, tmp_path, model__contraction=True)
+    pipeline = check_two_steps(config, EVENTS).pipeline
+    pipeline.eval()
+    lengths = torch.ones(2, 1)
+    rays = RayBundle(torch.full((2, 3), 5.0), torch.eye(3)[:2], lengths, metadata={"directions_norm": lengths})
+    with torch.no_grad():
+        outputs = pipeline.model(rays)
+    assert (outputs["rgb"] > 0).all() and all(output.isfinite().all() for output in outputs.values())
 
 
 def test_a_picture_without_depth_is_shown(pipeline: Any):

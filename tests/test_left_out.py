@@ -26,6 +26,7 @@ NOTHING: dict[str, Any] = {
     "model__sampling": "uniform",
     "model__num_channels": 1,
     "model__brightness": "log-sigmoid",
+    "model__contraction": False,
     "sensor__refractory_period_ns": 0,
     "sensor__contrast_thresholds": (0.25, 0.25),
 }
@@ -40,6 +41,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "colour": {"model__num_channels": 3},
     "refractory period": {"sensor__refractory_period_ns": 1000},
     "frame loss": {"data__supervision": "events+frames"},
+    "contraction": {"model__contraction": True},
 }
 
 
@@ -132,7 +134,10 @@ def test_a_part_costs_kernels_memory_or_parameters_only_where_it_is_kept(recordi
 def test_what_is_decided_to_be_left_out_costs_as_little_as_what_a_flag_leaves_out(recording: Path, tmp_path: Path):
     """The recording is grey, its sensor is never blind, and it is seen from one side."""
     decided = dict.fromkeys(
-        ("model__view_direction", "model__num_channels", "model__brightness", "sensor__refractory_period_ns")
+        (
+            *("model__view_direction", "model__num_channels", "model__brightness", "model__contraction"),
+            "sensor__refractory_period_ns",
+        )
     )
     by_flag = pipeline_of(recording, tmp_path / "flag")
     by_choice = pipeline_of(recording, tmp_path / "choice", **decided)

@@ -6,11 +6,22 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetworkSampler, UniformSampler
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    ProposalNetworkSampler,
+    UniformLinDispPiecewiseSampler,
+    UniformSampler,
+)
 from torch import Tensor
 
 from enerf_ns.enerf_model import BoxCollider
-from enerf_ns.ray_samplers import PairedPDFSampler, PairedRayBundle, PairedUniformSampler, paired_rand
+from enerf_ns.ray_samplers import (
+    PairedPDFSampler,
+    PairedPiecewiseSampler,
+    PairedRayBundle,
+    PairedUniformSampler,
+    paired_rand,
+)
 
 PAIRS, FRAME_RAYS = 5, 4
 
@@ -42,6 +53,10 @@ def uniform_samples(rays: RayBundle, single_jitter: bool) -> RaySamples:
     return PairedUniformSampler(num_samples=16, single_jitter=single_jitter).train()(rays)
 
 
+def piecewise_samples(rays: RayBundle, single_jitter: bool) -> RaySamples:
+    return PairedPiecewiseSampler(num_samples=16, single_jitter=single_jitter).train()(rays)
+
+
 def proposal_samples(rays: RayBundle, single_jitter: bool, training: bool = True, paired: bool = True) -> RaySamples:
     uniform, pdf = PairedUniformSampler(single_jitter=single_jitter), PairedPDFSampler(single_jitter=single_jitter)
     if not paired:
@@ -57,7 +72,7 @@ def proposal_samples(rays: RayBundle, single_jitter: bool, training: bool = True
 
 
 @pytest.mark.parametrize("single_jitter", [False, True])
-@pytest.mark.parametrize("sample", [uniform_samples, proposal_samples])
+@pytest.mark.parametrize("sample", [uniform_samples, piecewise_samples, proposal_samples])
 def test_both_rays_of_a_pair_get_the_same_samples_and_other_rays_their_own(sample, single_jitter: bool):
     torch.manual_seed(0)
     starts = sample(paired_rays(), single_jitter).frustums.starts[..., 0]
@@ -66,7 +81,7 @@ def test_both_rays_of_a_pair_get_the_same_samples_and_other_rays_their_own(sampl
     assert len(starts.unique(dim=0)) == PAIRS + FRAME_RAYS
 
 
-@pytest.mark.parametrize("sample", [uniform_samples, proposal_samples])
+@pytest.mark.parametrize("sample", [uniform_samples, piecewise_samples, proposal_samples])
 def test_rays_that_are_no_pairs_differ(sample):
     torch.manual_seed(0)
     starts = sample(replace(paired_rays(), num_pairs=0), True).frustums.starts[..., 0]
@@ -83,7 +98,8 @@ def test_samples_of_single_rays_are_those_of_nerfstudio(training: bool, single_j
         torch.manual_seed(1)
         samples.append(proposal_samples(rays, single_jitter, training, paired))
         uniform = (PairedUniformSampler if paired else UniformSampler)(16, True, single_jitter)
-        samples.append(uniform.train(training)(rays))
+        piecewise = (PairedPiecewiseSampler if paired else UniformLinDispPiecewiseSampler)(16, True, single_jitter)
+        samples += [uniform.train(training)(rays), piecewise.train(training)(rays)]
     for one, other in zip(found, expected, strict=True):
         for name in ("starts", "ends", "origins", "directions"):
             torch.testing.assert_close(getattr(one.frustums, name), getattr(other.frustums, name), rtol=0, atol=0)

@@ -50,6 +50,7 @@ def test_of_a_simulated_recording_it_is_what_its_frames_span(recording):
     from enerf_ns.dataparsers.indexing import index_events
 
     read = read_recording(recording)
+    assert read.frames is not None
     pictures = np.stack([load_image(file)[..., 0] for file in read.frames.filenames]) / 255.0
     levels = Linlog()(torch.from_numpy(pictures))
     spanned = float((levels.amax(0) - levels.amin(0)).quantile(0.99))
