@@ -166,7 +166,5 @@ def test_events_without_structure_are_refused():
 def test_slider_depth(shared_data: Path):
     """Its authors state depths of 0.45 to 2.07 m."""
     recording = read_recording(shared_data / "slider_depth")
-    near, far = measure_parallax(
-        index_events(recording).events(), recording.camera, recording.trajectory
-    ).depth_range
+    near, far = measure_parallax(index_events(recording).events(), recording.camera, recording.trajectory).depth_range
     assert 0.2 < near < 0.45 and 2.07 < far < 4.0
