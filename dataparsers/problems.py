@@ -312,9 +312,8 @@ def _distance_problems(
         found = f"its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by {shift:.1f} pixels"
     elif (parallax := recording_parallax(recording)).is_ruled_out:
         found = (
-            f"its events pile up {_times(parallax.num_at_infinity)} where its rotation alone puts them, "
-            f"{_times(len(parallax.depths))} at a depth in front of it, and {_times(parallax.num_by_chance)} behind it, "
-            "which is chance"
+            f"its rotation alone explains {parallax.num_at_infinity:,} parts of the views; depths explain "
+            f"{len(parallax.depths):,}, and depths behind the camera, which is chance, {parallax.num_by_chance:,}"
         )
     if found:
         yield Problem(
