@@ -170,7 +170,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)
-                events = EventBatch.joined([events, silent])
+                events = events.with_silent(silent)
         if "frames" in config.supervision:
             assert config.train_num_rays_per_batch is not None
             indices = self._frame_pixels(config.train_num_rays_per_batch)
@@ -203,7 +203,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """Rays of all first instants, from when the pixels can see, then of all second ones."""
         delays = sensor.blind_after(batch.start, batch.end)
         if delays is not None:
-            delays = torch.where(batch.silent, 0.0, delays)
+            delays[batch.silent] = 0.0
             delays = torch.cat([delays, torch.zeros_like(delays)])
         return self.event_camera.rays(batch.pixels.repeat(2), torch.cat([batch.start, batch.end]), delays)
 

@@ -373,7 +373,7 @@ class EnerfTrainer(Trainer):
         events = seen.batch.events
         if events is not None:
             start, end, _ = seen.batch.split(seen.rgb)
-            fired = ~events.silent
+            fired = events.fired
             change = brightness_change(start, end, events, sensor)[fired]
             measured = sensor.measured_change(events.on[fired], events.off[fired], events.pixels[fired])
             ratio = float(change.square().mean().sqrt() / measured.square().mean().sqrt())

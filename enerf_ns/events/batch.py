@@ -23,21 +23,36 @@ class EventBatch:
     """Number of positive events of each pair, after the first instant and up to and with the second."""
     off: Int64[Tensor, " pairs"]
     """Number of negative events of each pair, after the first instant and up to and with the second."""
-    silent: Bool[Tensor, " pairs"]
-    """Whether each pair is of a silent pixel, whose instants are any between two of its events."""
+    num_silent: int = 0
+    """Number of pairs of silent pixels, whose instants are any between two of their events; they come last."""
 
     def __len__(self) -> int:
         return len(self.pixels)
 
-    @staticmethod
-    def joined(batches: list[EventBatch]) -> EventBatch:
-        """One batch of several, in their order."""
-        columns = zip(*(vars(batch).values() for batch in batches), strict=True)
-        return EventBatch(*(torch.cat(column) for column in columns))
+    @property
+    def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What is known of each pair, in the order of the fields."""
+        return self.pixels, self.start, self.end, self.on, self.off
+
+    @property
+    def fired(self) -> slice:
+        """Which pairs are of events."""
+        return slice(len(self) - self.num_silent)
+
+    @property
+    def silent(self) -> slice:
+        """Which pairs are of silent pixels."""
+        return slice(len(self) - self.num_silent, None)
+
+    def with_silent(self, silent: EventBatch) -> EventBatch:
+        """A batch of these pairs, all of events, and then those of silent pixels."""
+        columns = zip(self.columns, silent.columns, strict=True)
+        return EventBatch(*(torch.cat(both) for both in columns), num_silent=len(silent))
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
-        return EventBatch(*(column[chosen] for column in vars(self).values()))
+        columns = (column[chosen] for column in self.columns)
+        return EventBatch(*columns, num_silent=int(chosen[self.silent].sum()))
 
 
 @dataclass(frozen=True)

@@ -101,8 +101,7 @@ class EventPairSampler:
             pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
         start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
         on = (self.index.positives[end] - self.index.positives[start]).long()
-        silent = torch.zeros_like(pixels, dtype=torch.bool)
-        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on, silent)
+        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
 
     def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         start = self._starts[pair]
@@ -204,7 +203,7 @@ class SilentPixelSampler:
         other += other >= one
         start, end = begin + torch.minimum(one, other), begin + torch.maximum(one, other)
         none = torch.zeros_like(pixels)
-        return EventBatch(pixels, start, end, none, none, torch.ones_like(pixels, dtype=torch.bool))
+        return EventBatch(pixels, start, end, none, none, num_silent=len(pixels))
 
     def _silent_intervals(self, draws: int, generator: torch.Generator, blind_ns: int) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""

@@ -98,9 +98,9 @@ def _not_finite_after(
 
 
 def _noise(events: EventBatch) -> EventBatch:
-    on = torch.randint(0, 9, events.on.shape)
-    off = torch.randint(0, 9, events.off.shape)
-    return replace(events, on=on * ~events.silent, off=off * ~events.silent)
+    on, off = torch.randint(0, 9, (2, len(events)))
+    on[events.silent] = off[events.silent] = 0
+    return replace(events, on=on, off=off)
 
 
 @case("events that are white noise", "finite losses", 0, "steps")

@@ -59,14 +59,14 @@ class EventSupervision:
             sensor: What measured it.
         """
         change = brightness_change(start, end, batch, sensor)
-        fired = ~batch.silent
+        fired, silent = batch.fired, batch.silent
         losses: dict[str, Tensor] = {}
         measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
         if len(measured):
             loss = EVENT_LOSSES[self.event_loss](change[fired], measured, sensor.mean_threshold)
             losses["event_loss"] = self.event_loss_weight * loss
-        if len(measured) < len(batch):
-            loss = no_event_loss(change[batch.silent], sensor.contrast_thresholds, self.no_event_margin)
+        if batch.num_silent:
+            loss = no_event_loss(change[silent], sensor.contrast_thresholds, self.no_event_margin)
             losses["no_event_loss"] = self.no_event_loss_weight * loss
         return losses
 
@@ -80,7 +80,7 @@ class EventSupervision:
         sensor: SensorModel,
     ) -> dict[str, Tensor]:
         """event_correlation: the linear correlation of rendered and measured changes; arguments as of `losses`."""
-        fired = ~batch.silent
+        fired = batch.fired
         change = brightness_change(start, end, batch, sensor)[fired]
         measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
         return {"event_correlation": torch.corrcoef(torch.stack([change, measured]))[0, 1]}

@@ -7,15 +7,21 @@ from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
 
 def events(number: int, first: int, silent: bool) -> EventBatch:
     columns = (torch.arange(first + i, first + i + number) for i in range(5))
-    return EventBatch(*columns, silent=torch.full((number,), silent))
+    return EventBatch(*columns, num_silent=number if silent else 0)
 
 
-def test_batches_are_joined_in_their_order():
-    joined = EventBatch.joined([events(3, 0, False), events(2, 100, True)])
+def test_silent_pairs_come_last():
+    joined = events(3, 0, False).with_silent(events(2, 100, True))
     assert len(joined) == 5
     assert joined.pixels.tolist() == [0, 1, 2, 100, 101]
     assert joined.off.tolist() == [4, 5, 6, 104, 105]
-    assert joined.silent.tolist() == [False, False, False, True, True]
+    assert joined.pixels[joined.fired].tolist() == [0, 1, 2] and joined.pixels[joined.silent].tolist() == [100, 101]
+
+
+def test_a_subset_knows_which_of_its_pairs_are_silent():
+    joined = events(3, 0, False).with_silent(events(2, 100, True))
+    subset = joined.subset(torch.tensor([True, False, True, False, True]))
+    assert subset.pixels[subset.fired].tolist() == [0, 2] and subset.off[subset.silent].tolist() == [105]
 
 
 def test_what_was_rendered_is_taken_apart_as_its_rays_were_put_together():
