@@ -27,9 +27,9 @@ from torch.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
 from enerf_ns.checkpoints import (
-    allow_numpy_scalars_in_checkpoints,
     checkpoint_path,
     is_whole,
+    load_checkpoint,
     newest_checkpoint,
     random_state,
     set_random_state,
@@ -88,7 +88,7 @@ class EnerfTrainerConfig(TrainerConfig):
         config.load_dir = self.load_dir and self.load_dir.expanduser().resolve()
         config.load_checkpoint = self.load_checkpoint and self.load_checkpoint.expanduser().resolve()
         checkpoint = config.checkpoint()
-        decays = load(checkpoint).get("max_steps", {}) if checkpoint else {}
+        decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
         for name, group in config.optimizers.items():
             scheduler = group["scheduler"]
             scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
@@ -132,7 +132,7 @@ class EnerfTrainerConfig(TrainerConfig):
                 raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
         else:
             return None
-        step = load(path)["step"]
+        step = load_checkpoint(path)["step"]
         if step + 1 >= self.max_num_iterations:
             raise FlagError(
                 f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give more "
@@ -181,12 +181,6 @@ class EnerfTrainerConfig(TrainerConfig):
             config = self.resolved()
             config.load_checkpoint, config.load_dir = config.checkpoint(), None
             return self._target(config, **kwargs)
-
-
-def load(checkpoint: Path) -> dict[str, Any]:
-    """What a checkpoint holds; of its tensors, only those that are used are read."""
-    allow_numpy_scalars_in_checkpoints()
-    return torch.load(checkpoint, map_location="cpu", mmap=True)
 
 
 class GuardedOptimizers(Optimizers):
@@ -247,7 +241,7 @@ class EnerfTrainer(Trainer):
         super()._load_checkpoint()
         if self.config.load_checkpoint is None:
             return
-        state = load(self.config.load_checkpoint)
+        state = load_checkpoint(self.config.load_checkpoint)
         if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
             set_random_state(state["generators"], self.pipeline.device)
             self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
