@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or not there, what a run needs to go on as if it had not stopped, and what loading needs."""
+"""Checkpoints that are whole or not there, and hold what a run needs to go on as if it had not stopped."""
 
 from __future__ import annotations
 
@@ -65,7 +65,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 @cache
 def _say_passed_over(path: Path) -> None:
     CONSOLE.print(
-        f"{path} is cut short or damaged; the checkpoint before it is used.", soft_wrap=True, markup=False, style="yellow"
+        f"{path} is cut short or damaged; the checkpoint before it is used.",
+        soft_wrap=True,
+        markup=False,
+        style="yellow",
     )
 
 

@@ -23,7 +23,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
-from torch.amp.grad_scaler import GradScaler
+from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
 from enerf_ns.checkpoints import (
@@ -143,9 +143,9 @@ class EnerfTrainerConfig(TrainerConfig):
     def get_checkpoint_dir(self) -> Path:
         """The folder of the run's checkpoints; `load_step` becomes that of the newest whole one in it.
 
-        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they load
-        `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which they
-        can be told better.
+        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they
+        load `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which
+        they can be told better.
 
         Raises:
             SystemExit: The folder is there, but no whole checkpoint in it; with one sentence.
@@ -192,9 +192,7 @@ class GuardedOptimizers(Optimizers):
         is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed.
     """
 
-    def __init__(
-        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]
-    ):
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]):
         super().__init__(config, param_groups)
         self.is_finite = is_finite
         self.skipped = False
@@ -264,7 +262,9 @@ class EnerfTrainer(Trainer):
                 **random_state(pipeline.device),
                 "batches": pipeline.datamanager.generator.get_state(),
             },
-            "sampler": {name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS},
+            "sampler": {
+                name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
+            },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
         try:
@@ -319,8 +319,11 @@ class EnerfTrainer(Trainer):
         """
         numbers = list(self.pipeline.last_step.losses.values())
         if self.grad_scaler.get_scale() <= 1:
-            gradients = [parameter.grad for parameter in self.pipeline.parameters() if parameter.grad is not None]
-            numbers += torch._foreach_norm(gradients)
+            numbers += [
+                torch.linalg.vector_norm(parameter.grad)
+                for parameter in self.pipeline.parameters()
+                if parameter.grad is not None
+            ]
         return bool(torch.stack([number.float() for number in numbers]).isfinite().all())
 
     def _look_at_skipped(self, step: int) -> None:
@@ -346,9 +349,9 @@ class EnerfTrainer(Trainer):
             _say(f"Step {step} is left out, since {terms[0]} is not finite; its batch is {file}.")
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
-                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a row; "
-                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
-                "recording."
+                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a "
+                f"row; the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on "
+                "the recording."
             )
 
     @torch.no_grad()
@@ -371,8 +374,8 @@ class EnerfTrainer(Trainer):
             self._found_wrong.add(reason)
             _say(
                 f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
-                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and clock "
-                "with `enerf inspect`."
+                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and "
+                "clock with `enerf inspect`."
             )
 
     def _handle_signals(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 from torch import Tensor
+from torch.amp.grad_scaler import GradScaler
 
 from enerf_ns import enerf_trainer
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
@@ -86,7 +88,7 @@ def test_a_step_that_is_not_finite_changes_nothing(recording: Path, tmp_path: Pa
         rates.append(trainer.optimizers.optimizers["fields"].param_groups[0]["lr"])
         trainer.train_iteration(step)
         states.append(learnt(trainer))
-    same = [len(tensors(a)) == len(tensors(b)) and equal(a, b) for a, b in zip(states, states[1:], strict=False)]
+    same = [len(tensors(a)) == len(tensors(b)) and equal(a, b) for a, b in pairwise(states)]
     assert same == [True, False, True, False, False]
     assert all(tensor.isfinite().all() for tensor in tensors(states[-1]))
     assert rates == pytest.approx([rates[0] * 0.1 ** (step / 5) for step in range(5)])
@@ -109,7 +111,9 @@ def test_after_some_in_a_row_training_stops_and_the_last_checkpoint_stays(
     config.max_num_iterations, config.steps_per_save = 20, 2
     loss, culprit = BROKEN[name]
     trainer = breaking(config, {3, *range(5, 30)}, loss)
-    with pytest.raises(SystemExit, match=rf"^enerf: Training stopped at step 9, since {culprit}.* is not finite, 5 steps"):
+    with pytest.raises(
+        SystemExit, match=rf"^enerf: Training stopped at step 9, since {culprit}.* is not finite, 5 steps"
+    ):
         trainer.train()
     assert "Training is done" not in capsys.readouterr().out
     assert trainer.num_skipped == 6
@@ -146,36 +150,33 @@ def test_a_gradient_scaler_lowers_its_scale_by_itself(recording: Path, tmp_path:
     """Gradients that overflow under its scale are no fault; a loss that is not finite is one."""
     config = small_config(recording, tmp_path)
     trainer = breaking(config, {0, 2}, lambda change, *_: (change - change.detach()).sum() * 1e37)
-    trainer.grad_scaler = torch.amp.GradScaler("cpu", init_scale=2.0**16)
+    trainer.grad_scaler = GradScaler("cpu", init_scale=2.0**16)
     states = [learnt(trainer)["parameters"]]
     for step in range(3):
         trainer.train_iteration(step)
         states.append(learnt(trainer)["parameters"])
-    assert [equal(a, b) for a, b in zip(states, states[1:], strict=False)] == [True, False, True]
+    assert [equal(a, b) for a, b in pairwise(states)] == [True, False, True]
     assert trainer.grad_scaler.get_scale() == 2.0**14 and trainer.num_skipped == 0
     trainer = breaking(config, {1}, infinite_loss)
-    trainer.grad_scaler = torch.amp.GradScaler("cpu", init_scale=2.0**16)
+    trainer.grad_scaler = GradScaler("cpu", init_scale=2.0**16)
     trainer.train_iteration(0)
     before = learnt(trainer)["parameters"]
     trainer.train_iteration(1)
     assert equal(before, learnt(trainer)["parameters"]) and trainer.num_skipped == 1
 
 
-REASONS = {"the rendered change of log brightness is", "rays meet no surface anywhere"}
-
-
 @pytest.mark.parametrize(
-    ("changes", "rate", "expected"),
+    ("changes", "rate", "learns"),
     [
-        ({}, None, set()),
-        ({"model__sampling": "uniform"}, None, set()),
-        ({"data__supervision": "frames"}, None, set()),
-        ({}, 1.0, {"the rendered change of log brightness is"}),
-        ({"sensor__contrast_thresholds": (1e6, 1e6)}, None, {"the rendered change of log brightness is"}),
+        ({}, None, True),
+        ({"model__sampling": "uniform"}, None, True),
+        ({"data__supervision": "frames"}, None, True),
+        ({}, 1.0, False),
+        ({"sensor__contrast_thresholds": (1e6, 1e6)}, None, False),
     ],
 )
 def test_a_run_that_learns_nothing_says_so_once(
-    recording: Path, tmp_path: Path, capsys, monkeypatch, changes: dict, rate: float | None, expected: set[str]
+    recording: Path, tmp_path: Path, capsys, monkeypatch, changes: dict, rate: float | None, learns: bool
 ):
     monkeypatch.setattr(enerf_trainer, "LEARNING_CHECKED_FROM", 60)
     monkeypatch.setattr(enerf_trainer, "LEARNING_CHECKED_EVERY", 20)
@@ -183,11 +184,12 @@ def test_a_run_that_learns_nothing_says_so_once(
     config.max_num_iterations = 110
     if rate is not None:
         config.optimizers["fields"]["optimizer"].lr = rate
-    set_up(config).train()
+    trainer = set_up(config)
+    for step in range(110):
+        trainer.train_iteration(step)
     said = capsys.readouterr().out
-    for reason in REASONS:
-        assert said.count(reason) == (reason in expected)
-    assert not expected or "Nothing is learnt at step 60" in said
+    assert ("Nothing is learnt at step 60" in said) == (not learns)
+    assert said.count("the rendered change of log brightness is") == (not learns)
 
 
 def test_a_field_without_density_is_told(recording: Path, tmp_path: Path, capsys):

@@ -132,7 +132,7 @@ def test_what_an_interrupted_run_prints_continues_it(recording: Path, tmp_path: 
     main(config)
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
     assert (trainer.base_dir / "config.yml").read_text() == written
-    assert f"is at its end, at step 5 of 5" not in capsys.readouterr().out
+    assert "is at its end, at step 5 of 5" not in capsys.readouterr().out
     main(config)
     assert f"{trainer.base_dir} is at its end, at step 5 of 5." in capsys.readouterr().out
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
