@@ -350,8 +350,8 @@ class EnerfTrainer(Trainer):
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
                 f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a "
-                f"row; the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on "
-                "the recording."
+                f"row; the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` "
+                "on the recording."
             )
 
     @torch.no_grad()
