@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or not there, what a run needs to go on as if it had not stopped, and what loading needs."""
+"""Checkpoints that are whole or not there, and hold what a run needs to go on as if it had not stopped."""
 
 from __future__ import annotations
 
@@ -46,12 +46,20 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether all of a file that torch.save wrote is there as it was written, by the checksums in it."""
+    """Whether all of a checkpoint is there as it was written, by the checksums in it, and torch can read it."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return archive.testzip() is None
+            sound = archive.testzip() is None
+        load_checkpoint(path)
     except Exception:  # of any kind, depending on where the damage lies
         return False
+    return sound
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """What a checkpoint holds; its tensors are read when they are used."""
+    allow_numpy_scalars_in_checkpoints()
+    return torch.load(path, map_location="cpu", mmap=True)
 
 
 @cache

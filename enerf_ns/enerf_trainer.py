@@ -23,13 +23,13 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
-from torch.amp.grad_scaler import GradScaler
+from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
 from enerf_ns.checkpoints import (
-    allow_numpy_scalars_in_checkpoints,
     checkpoint_path,
     is_whole,
+    load_checkpoint,
     newest_checkpoint,
     random_state,
     set_random_state,
@@ -91,7 +91,7 @@ class EnerfTrainerConfig(TrainerConfig):
         config.load_dir = self.load_dir and self.load_dir.expanduser().resolve()
         config.load_checkpoint = self.load_checkpoint and self.load_checkpoint.expanduser().resolve()
         checkpoint = config.checkpoint()
-        decays = load(checkpoint).get("max_steps", {}) if checkpoint else {}
+        decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
         for name, group in config.optimizers.items():
             scheduler = group["scheduler"]
             scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
@@ -138,7 +138,7 @@ class EnerfTrainerConfig(TrainerConfig):
                 raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
         else:
             return None
-        step = load(path)["step"]
+        step = load_checkpoint(path)["step"]
         if step + 1 >= self.max_num_iterations:
             raise FlagError(
                 f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give more "
@@ -149,9 +149,9 @@ class EnerfTrainerConfig(TrainerConfig):
     def get_checkpoint_dir(self) -> Path:
         """The folder of the run's checkpoints; `load_step` becomes that of the newest whole one in it.
 
-        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they load
-        `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which they
-        can be told better.
+        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they
+        load `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which
+        they can be told better.
 
         Raises:
             SystemExit: The folder is there, but no whole checkpoint in it; with one sentence.
@@ -187,12 +187,6 @@ class EnerfTrainerConfig(TrainerConfig):
             config = self.resolved()
             config.load_checkpoint, config.load_dir = config.checkpoint(), None
             return self._target(config, **kwargs)
-
-
-def load(checkpoint: Path) -> dict[str, Any]:
-    """What a checkpoint holds; of its tensors, only those that are used are read."""
-    allow_numpy_scalars_in_checkpoints()
-    return torch.load(checkpoint, map_location="cpu", mmap=True)
 
 
 class GuardedOptimizers(Optimizers):
@@ -251,7 +245,7 @@ class EnerfTrainer(Trainer):
         super()._load_checkpoint()
         if self.config.load_checkpoint is None:
             return
-        state = load(self.config.load_checkpoint)
+        state = load_checkpoint(self.config.load_checkpoint)
         if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
             set_random_state(state["generators"], self.pipeline.device)
             self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
@@ -331,8 +325,11 @@ class EnerfTrainer(Trainer):
         """
         numbers = list(self.pipeline.last_step.losses.values())
         if self.grad_scaler.get_scale() <= 1:
-            gradients = [parameter.grad for parameter in self.pipeline.parameters() if parameter.grad is not None]
-            numbers += torch._foreach_norm(gradients)
+            numbers += [
+                torch.linalg.vector_norm(parameter.grad)
+                for parameter in self.pipeline.parameters()
+                if parameter.grad is not None
+            ]
         return bool(torch.stack([number.float() for number in numbers]).isfinite().all())
 
     def _look_at_skipped(self, step: int) -> None:
@@ -358,9 +355,9 @@ class EnerfTrainer(Trainer):
             _say(f"Step {step} is left out, since {terms[0]} is not finite; its batch is {file}.")
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
-                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a row; "
-                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
-                "recording."
+                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a "
+                f"row; the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` "
+                "on the recording."
             )
 
     @torch.no_grad()
@@ -383,8 +380,8 @@ class EnerfTrainer(Trainer):
             self._found_wrong.add(reason)
             _say(
                 f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
-                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and clock "
-                "with `enerf inspect`."
+                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and "
+                "clock with `enerf inspect`."
             )
 
     def _handle_signals(self) -> None:

@@ -343,7 +343,8 @@ def test_resume(call, run: Path, tmp_path: Path):
     """Training goes on from the checkpoint with its parameters, its optimizer and its step."""
     checkpoints = run.parent / "nerfstudio_models"
     recording = yaml.load(run.read_text(), Loader=yaml.Loader).data
-    call("ns-train", "enerf", "--data", recording, *SMALL, "--load-dir", checkpoints, "--timestamp", "resumed")
+    longer = ["--load-dir", checkpoints, "--timestamp", "resumed", "--max-num-iterations", 10]
+    call("ns-train", "enerf", "--data", recording, *SMALL, *longer)
     (file,) = tmp_path.glob("outputs/recording/enerf/resumed/nerfstudio_models/*.ckpt")
     before, after = (torch.load(path) for path in (checkpoints / "step-000000004.ckpt", file))
     assert (before["step"], after["step"]) == (4, 9)
