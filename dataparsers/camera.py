@@ -171,6 +171,10 @@ class Camera:
             )
         return directions.reshape(*columns.shape, 3)
 
+    def without_lens(self) -> Camera:
+        """The pinhole camera of the same focal lengths and principal point, as if the lens did not distort."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
     def undistorted(self) -> Camera:
         """The pinhole camera of the same size whose image holds only pixels that this camera sees; itself if pinhole.
 
@@ -180,7 +184,7 @@ class Camera:
         if self.model == "pinhole":
             return self
         if self.model == "lookup":
-            return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+            return self.without_lens()
         size, coefficients = (self.width, self.height), np.array(self.distortion)
         if self.model == "fisheye":
             matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(

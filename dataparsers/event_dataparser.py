@@ -58,6 +58,8 @@ class EventDataParserConfig(DataParserConfig):
     """Use pixels that fire far more often than their neighbourhood."""
     keep_pose_gaps: bool = False
     """Use what lies in gaps between poses, which are guesses there."""
+    undistort: bool = True
+    """Undo the distortion of the lenses that the calibration states. False: as if there were none."""
     train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
     """Numbers of the frames to train on, from 0. None: all that are not held out."""
     held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
@@ -78,7 +80,7 @@ class EventDataParser(DataParser):
         """The recording of this parser's folder, read once per process."""
         config = self.config
         time_range = config.time_range and (config.time_range[0], config.time_range[1])  # a list, from some YAML
-        selection = time_range, config.keep_hot_pixels, config.keep_pose_gaps
+        selection = time_range, config.keep_hot_pixels, config.keep_pose_gaps, config.undistort
         return read_recording(config.data, config.format, *selection, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:

@@ -158,7 +158,11 @@ class EventRecording:
         self._set(**covered, notes=tuple(notes), shares_outside_poses=shares)
 
     def selected(
-        self, time_range: tuple[float, float] | None, keep_hot_pixels: bool, keep_pose_gaps: bool = False
+        self,
+        time_range: tuple[float, float] | None,
+        keep_hot_pixels: bool,
+        keep_pose_gaps: bool = False,
+        undistort: bool = True,
     ) -> EventRecording:
         """The recording of which a part of the events is used; for one selection always the same object.
 
@@ -166,6 +170,7 @@ class EventRecording:
             time_range: First and last time in seconds on the recording's clock, or None for all.
             keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
             keep_pose_gaps: Use instants within the gaps of the trajectory.
+            undistort: Believe the distortion of the cameras; otherwise they have none.
 
         Raises:
             FlagError: The range holds no poses, or lies within a gap that is left out.
@@ -175,6 +180,8 @@ class EventRecording:
         chosen = range_ns, keep_hot_pixels, keep_pose_gaps
         if chosen != (self.time_range, self.keep_hot_pixels, self.keep_pose_gaps):
             selection = _with_selection(self, *chosen)
+        if not undistort:
+            selection = _without_lenses(selection)
         start, end = selection.span
         if time_range is not None and not start < end:
             raise FlagError(
@@ -305,6 +312,14 @@ def _with_selection(
     recording: EventRecording, time_range: tuple[int, int] | None, keep_hot_pixels: bool, keep_pose_gaps: bool
 ) -> EventRecording:
     return replace(recording, time_range=time_range, keep_hot_pixels=keep_hot_pixels, keep_pose_gaps=keep_pose_gaps)
+
+
+@cache
+def _without_lenses(recording: EventRecording) -> EventRecording:
+    kinds = ("frames", "blurred_frames", "held_out_frames")
+    frames = {kind: getattr(recording, kind) for kind in kinds}
+    frames = {kind: value and replace(value, camera=value.camera.without_lens()) for kind, value in frames.items()}
+    return replace(recording, camera=recording.camera.without_lens(), **frames)
 
 
 def left_out(dropped: int, total: int, what: str) -> str:

@@ -161,7 +161,9 @@ class _Resolver:
             self.preset_values, self.selection = selections(name, recording, self.parser, paper_batch)
             self._note_flags()
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
-        self.recording = recording.selected(time_range, self.parser.keep_hot_pixels, self.parser.keep_pose_gaps)
+        parser = self.parser
+        selection = parser.keep_hot_pixels, parser.keep_pose_gaps, parser.undistort
+        self.recording = recording.selected(time_range, *selection)
 
     @property
     def use_events(self) -> bool:
@@ -402,7 +404,8 @@ class _Resolver:
         """Where the scene lies, and how finely it is looked at."""
         model, recording = self.config.model, self.recording
         lens = recording.camera.model
-        self.row("undistortion", lens != "pinhole", lens, "the calibration states it", f"{DATAPARSER}.undistort")
+        why = "the calibration states it" if self.parser.undistort else "set by flag"
+        self.row("undistortion", lens != "pinhole", lens, why, f"{DATAPARSER}.undistort")
 
         name = f"{DATAPARSER}.depth_range"
         box = self.use(f"{DATAPARSER}.box", lambda: None)

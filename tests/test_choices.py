@@ -11,16 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from small_runs import EVENTS, WIDTH, check_two_steps, small_config
+from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, small_config
 
 from enerf_ns.choices import Choice, Resolution, is_colour, resolve
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Events
+from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf, enerf_paper
+from enerf_ns.numerics.points import CAMERA, TURNING, recording_of_points, shaking
 from enerf_ns.sensor.response import Logarithm
 
 ENERF: Any = enerf.config.pipeline
 PAPER: Any = enerf_paper.config.pipeline
+LENS = Camera(WIDTH, HEIGHT, 30.0, 31.0, 15.5, 11.5, (-0.1, 0.01, 0.0, 0.0), "radtan")
 
 
 @pytest.mark.parametrize("supervision", ["events", "events+frames"])
@@ -191,3 +196,109 @@ def test_a_depth_range_that_is_none_is_refused_before_anything_is_written(record
     with pytest.raises(SystemExit, match="event-data --depth-range is"):
         config.save_config()
     assert not (tmp_path / "outputs").exists()
+
+
+def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recording: Path, tmp_path: Path):
+    """The flag of each row is one of the config; set to each answer, the row says so and that a flag did it."""
+    forced: dict[str, tuple[Any, Any]] = {
+        "pose gaps": (True, False),
+        "event loss": ("events", "frames"),
+        "silent pixels": (7, 0),
+        "threshold per polarity": ((0.2, 0.3), (0.2, 0.2)),
+        "refractory period": (1000, 0),
+        "high dynamic range": ("exponential", "log-sigmoid"),
+        "frame loss": ("events+frames", "events"),
+        "second camera": ("events+frames", "events"),
+        "colour": (3, 1),
+        "undistortion": (True, False),
+        "contraction": (True, False),
+        "proposal network": ("proposal", "uniform"),
+        "opacity loss": (1.0, 0.0),
+        "view direction": (True, False),
+    }
+    always_kept = {"response", "box", "hash grid"}
+    config = copy.deepcopy(ENERF)
+    config.datamanager.supervision = "events+frames"
+    distorted = replace(read_recording(recording), camera=LENS, depth_range=(1.0, 4.0))
+    default = rows(resolve(config, distorted))
+    assert set(default) == {*forced, *always_kept}
+    assert all(default[part].kept for part in always_kept) and default["second camera"].kept
+    for part, answers in forced.items():
+        *parents, name = default[part].flag.replace("event-data --", "pipeline.datamanager.dataparser.").split(".")
+        for value, kept in zip(answers, (True, False), strict=True):
+            config = copy.deepcopy(ENERF)
+            owner = config
+            for parent in [parent.strip("-") for parent in parents][1:]:
+                owner = getattr(owner, parent)
+            field = name.replace("-", "_")
+            owner = config.model.sensor if hasattr(config.model.sensor, field) else owner
+            assert hasattr(owner, field)
+            setattr(owner, field, value)
+            row = rows(resolve(config, distorted)).get(part)
+            if part == "pose gaps":  # there are none to keep
+                assert row is not None and not row.kept
+            else:
+                assert (row is not None and row.kept) == kept, (part, value)
+
+
+def test_a_lens_may_be_ignored(recording: Path):
+    distorted = replace(read_recording(recording), camera=LENS)
+    plain = distorted.selected(None, False, undistort=False)
+    assert plain.camera == Camera(WIDTH, HEIGHT, 30.0, 31.0, 15.5, 11.5) and plain.frames is not None
+    assert plain is distorted.selected(None, False, undistort=False)
+    assert distorted.selected(None, False).camera == LENS
+
+
+@pytest.mark.parametrize(("spread", "expected"), [(1, "log-sigmoid"), (20, "exponential")])
+def test_what_events_span_decides_whether_brightness_has_a_limit(recording: Path, spread: int, expected: str):
+    """Pixels whose log brightness rises by so many thresholds of 0.25 and falls again."""
+    polarity = np.repeat([1, -1] * 3, spread)
+    times = np.arange(len(polarity)) * 1_000_000 + 10_000_000
+    pixels = np.tile(np.arange(WIDTH * HEIGHT), len(times))
+    times, polarity = np.repeat(times, WIDTH * HEIGHT), np.repeat(polarity, WIDTH * HEIGHT).astype(np.int8)
+    events = Events(pixels % WIDTH, pixels // WIDTH, times, polarity)
+    long = read_recording(recording)
+    trajectory = Trajectory(long.trajectory.times * 2, long.trajectory.positions, long.trajectory.quaternions)
+    made = replace(
+        long, trajectory=trajectory, stream_events=lambda: iter([events]), frames=None, blurred_frames=None,
+        contrast_thresholds=(0.25, 0.25),
+    )  # fmt: skip
+    row = rows(resolve(ENERF, made))["high dynamic range"]
+    assert row.value == expected and row.kept == (expected == "exponential")
+    assert f"span {0.25 * spread:.2g} of log brightness" in row.why
+
+
+def test_events_from_beyond_the_box_decide_on_contraction():
+    generator = np.random.default_rng(4)
+    depths = np.exp(generator.uniform(0.0, np.log(2.0), (400, 1)))
+    for far_points in (0, 240):
+        depths[:far_points] = 300.0
+        points = depths * np.append(generator.uniform(-0.6, 0.6, (400, 2)), np.ones((400, 1)), axis=1)
+        events, trajectory, _ = recording_of_points(points, shaking(0.1), TURNING)
+        made = EventRecording(Path("memory"), "", CAMERA, trajectory, lambda events=events: iter([events]), ())
+        resolution = resolve(ENERF, made)
+        row = rows(resolution)["contraction"]
+        assert row.kept == resolution.values["model.contraction"] == bool(far_points)
+        assert "come from beyond" in row.why
+
+
+def test_a_silent_border_is_an_object_before_nothing(recording: Path):
+    whole = read_recording(recording)
+
+    def inner() -> Any:
+        for events in whole.stream_events():
+            inside = (events.x > 2) & (events.x < WIDTH - 3) & (events.y > 2) & (events.y < HEIGHT - 3)
+            yield Events(events.x[inside], events.y[inside], events.t[inside], events.p[inside])
+
+    for stream, expected in ((whole.stream_events, 1.0), (inner, 0.0)):
+        resolution = resolve(ENERF, replace(whole, stream_events=stream))
+        assert resolution.values["model.opacity_loss_weight"] == expected
+        assert rows(resolution)["opacity loss"].kept == bool(expected)
+
+
+@pytest.mark.parametrize(("max_res", "levels"), [(16, 1), (32, 3), (64, 5), (256, 9), (4096, 10)])
+def test_levels_of_the_grid_are_never_closer_than_they_help(recording: Path, max_res: int, levels: int):
+    config = copy.deepcopy(ENERF)
+    config.model.max_res = max_res
+    assert resolve(config, read_recording(recording)).values["model.num_levels"] == levels
+    assert levels == 1 or (max_res / 16) ** (1 / (levels - 1)) >= 1.39

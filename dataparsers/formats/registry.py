@@ -60,6 +60,7 @@ def read_recording(
     time_range: tuple[float, float] | None = None,
     keep_hot_pixels: bool = False,
     keep_pose_gaps: bool = False,
+    undistort: bool = True,
     **options: object,
 ) -> EventRecording:
     """Reads a recording; its events are read when first asked for. A folder is read once per process.
@@ -68,7 +69,7 @@ def read_recording(
         path: Folder of the recording; never written to.
         format: Name of a registered format, or "auto" to find out.
         time_range: As of `EventRecording.selected`.
-        keep_hot_pixels, keep_pose_gaps: As of `EventRecording.selected`.
+        keep_hot_pixels, keep_pose_gaps, undistort: As of `EventRecording.selected`.
         options: Of the format, by name; those left out have its defaults.
 
     Raises:
@@ -76,7 +77,7 @@ def read_recording(
         FlagError: There is no such format, it lacks an option, or the range of time cannot be used.
     """
     found = _read_folder(Path(path).resolve(), format, **options)
-    return found.selected(time_range, keep_hot_pixels, keep_pose_gaps)
+    return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort)
 
 
 def layouts() -> tuple[str, ...]:
