@@ -34,6 +34,7 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -122,6 +123,7 @@ RECORDINGS: dict[str, Callable[[Path], Path]] = {
 def make_opaque(config: Path) -> Path:
     """Raises the density of a run: a few steps make no surface, and `ns-export pointcloud` waits for one."""
     (file,) = (config.parent / "nerfstudio_models").glob("step-*.ckpt")
+    allow_numpy_scalars_in_checkpoints()
     checkpoint = torch.load(file)
     checkpoint["pipeline"]["_model.field.geometry.network.layers.1.bias"][0] += 8.0
     torch.save(checkpoint, file)
