@@ -3,11 +3,10 @@ becomes of a run that is interrupted, or whose steps go wrong."""
 
 from __future__ import annotations
 
-import io
 import json
 import shlex
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,15 +15,12 @@ from typing import Any, Optional, Type  # noqa: UP035 - tyro reads these annotat
 
 import torch
 import yaml
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 from torch import Tensor
-from torch.cuda.amp.grad_scaler import GradScaler
-from torch.nn import Parameter
 
 from enerf_ns.checkpoints import (
     checkpoint_path,
@@ -37,24 +33,23 @@ from enerf_ns.checkpoints import (
 )
 from enerf_ns.choices import Choice, resolve
 from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence
-from enerf_ns.dataparsers.files import write_together, write_whole
+from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
+from enerf_ns.guarded_steps import (
+    LEARNING_CHECKED_EVERY,
+    LEARNING_CHECKED_FROM,
+    MOST_SKIPPED,
+    GuardedOptimizers,
+    keep_batch,
+    what_is_not_finite,
+    why_nothing_is_learnt,
+)
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
-from enerf_ns.supervision.event_supervision import brightness_change
-
-MOST_SKIPPED = 5
-"""Steps in a row that may be skipped because they are not finite, before training stops."""
-
-LEARNING_CHECKED_EVERY, LEARNING_CHECKED_FROM = 100, 300
-"""Steps between looks at whether anything is learnt, and steps before the first."""
-
-NOTHING = 1e-3
-"""Share of the measured change of log brightness, or of a ray, below which a field renders nothing."""
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
@@ -189,33 +184,6 @@ class EnerfTrainerConfig(TrainerConfig):
             return self._target(config, **kwargs)
 
 
-class GuardedOptimizers(Optimizers):
-    """Nerfstudio's optimisers, which leave out a step that is not finite.
-
-    Args:
-        config: Optimisers and schedulers by the name of the group of parameters.
-        param_groups: Parameters by the name of the group.
-        is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed.
-    """
-
-    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]):
-        super().__init__(config, param_groups)
-        self.is_finite = is_finite
-        self.skipped = False
-        """Whether the last step was left out."""
-
-    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        self.skipped = not self.is_finite()
-        if self.skipped and not grad_scaler.is_enabled():
-            return
-        if self.skipped:  # the scaler must see it, to leave the step out itself
-            for group in param_groups:
-                for parameter in self.parameters[group]:
-                    if parameter.grad is not None:
-                        parameter.grad.fill_(torch.nan)
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
-
-
 class EnerfTrainer(Trainer):
     """Nerfstudio's trainer, which survives: an interruption, a full disk, a step that is not finite.
 
@@ -335,47 +303,27 @@ class EnerfTrainer(Trainer):
     def _look_at_skipped(self, step: int) -> None:
         """Counts a step that was left out, keeps the batch of the first, and gives up after some in a row."""
         seen = self.pipeline.last_step
-        terms = [name for name, loss in seen.losses.items() if not loss.isfinite()] + [
-            f"the gradient of {name}"
-            for name, parameter in self.pipeline.model.named_parameters()
-            if parameter.grad is not None and not parameter.grad.norm().isfinite()
-        ]
+        term = what_is_not_finite(seen, self.pipeline.model)
         self.optimizers.zero_grad_all()  # of which some may be gathered over several steps
         self.num_skipped += 1
         self._skipped_in_a_row += 1
         if self.num_skipped == 1:
             file = self.base_dir / f"skipped-step-{step:09d}.pt"
-            content = io.BytesIO()
-            batch = {name: vars(part) for name, part in vars(seen.batch).items() if part is not None}
-            torch.save({"step": step, "losses": seen.losses, **batch}, content)
             try:
-                write_whole(file, content.getvalue())
+                keep_batch(seen, step, file)
             except OSError as error:
                 file = f"not kept ({error.strerror})"
-            _say(f"Step {step} is left out, since {terms[0]} is not finite; its batch is {file}.")
+            _say(f"Step {step} is left out, since {term} is not finite; its batch is {file}.")
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
-                f"enerf: Training stopped at step {step}, since {terms[0]} is not finite, {MOST_SKIPPED} steps in a "
-                f"row; the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` "
-                "on the recording."
+                f"enerf: Training stopped at step {step}, since {term} is not finite, {MOST_SKIPPED} steps in a row; "
+                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
+                "recording."
             )
 
-    @torch.no_grad()
     def _look_at_learning(self, step: int) -> None:
         """Says, once for each reason, that what is rendered is nothing."""
-        seen, sensor, found = self.pipeline.last_step, self.pipeline.model.sensor, {}
-        accumulation = float(seen.accumulation.mean())
-        if accumulation < NOTHING:
-            found["empty"] = f"rays meet no surface anywhere: they are stopped by {accumulation:.1g} of one on average"
-        events = seen.batch.events
-        if events is not None:
-            start, end, _ = seen.batch.split(seen.rgb)
-            fired = events.fired
-            change = brightness_change(start, end, events, sensor)[fired]
-            measured = sensor.measured_change(events.on[fired], events.off[fired], events.pixels[fired])
-            ratio = float(change.square().mean().sqrt() / measured.square().mean().sqrt())
-            if ratio < NOTHING:
-                found["constant"] = f"the rendered change of log brightness is {ratio:.1g} of the measured one"
+        found = why_nothing_is_learnt(self.pipeline.last_step, self.pipeline.model.sensor)
         for reason in found.keys() - self._found_wrong:
             self._found_wrong.add(reason)
             _say(

@@ -69,12 +69,9 @@ def small_trainer(changes: Mapping[str, Any] = MappingProxyType({})) -> EnerfTra
 
 
 @contextmanager
-def quiet() -> Iterator[StringIO]:
-    """Nothing is printed within the block; what would have been is given."""
-    file, printed = CONSOLE.file, StringIO()
-    CONSOLE.file = printed
-    try:
-        with redirect_stdout(printed):
-            yield printed
-    finally:
-        CONSOLE.file = file
+def quiet() -> Iterator[list[str]]:
+    """Nothing is printed within the block; what would have been is in the list afterwards."""
+    printed: list[str] = []
+    with redirect_stdout(StringIO()) as plain, CONSOLE.capture() as captured:
+        yield printed
+    printed += [captured.get(), plain.getvalue()]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from enerf_ns.evaluation.runs import train
+from enerf_ns.checkpoints import checkpoint_path, newest_checkpoint
+from enerf_ns.evaluation.runs import set_up, train
 from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.numerics.case import case
 from enerf_ns.numerics.small_run import quiet, small_config, small_trainer
@@ -126,12 +126,12 @@ def one_pair() -> float:
 
 @case("a learning rate of 1", "finite losses, and a line that says that nothing is learnt", 0, "things amiss")
 def collapse() -> float:
-    config = small_config({"optimizers": None} if False else MappingProxyType({"max_num_iterations": 450}))
+    config = small_config({"max_num_iterations": 350})
     config.optimizers["fields"]["optimizer"].lr = 1.0
     with quiet() as printed:
         run = train(config)
     finite = all(value.isfinite().all() for value in run.pipeline.parameters())
-    return int(not finite) + int("Nothing is learnt" not in printed.getvalue())
+    return int(not finite) + int("Nothing is learnt" not in printed[0])
 
 
 @case("a run cut in two after 30 of 60 steps", "the weights and running means of one that was not", 0, "numbers")
@@ -146,12 +146,27 @@ def resumed() -> float:
         first.save_checkpoint(29)
         config = small_config({"max_num_iterations": 60})
         config.load_dir = first.checkpoint_dir
-        from enerf_ns.evaluation.runs import set_up
-
         second: Any = set_up(config)
         for step in range(30, 60):
             _step(second, step)
     return _different(_state(whole), _state(second))
+
+
+@case("a newest checkpoint cut short, or with one byte changed", "the one before it is loaded", 0, "wrong answers")
+def damaged_checkpoint() -> float:
+    with quiet():
+        trainer: Any = small_trainer({"save_only_latest_checkpoint": False})
+        for step in (0, 1):
+            trainer.train_iteration(step)
+            trainer.save_checkpoint(step)
+        before, newest = (checkpoint_path(trainer.checkpoint_dir, step) for step in (0, 1))
+        content = newest.read_bytes()
+        wrong = int(newest_checkpoint(trainer.checkpoint_dir) != newest)
+        middle = len(content) // 2
+        for damaged in (content[:middle], content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]):
+            newest.write_bytes(damaged)
+            wrong += int(newest_checkpoint(trainer.checkpoint_dir) != before)
+    return wrong
 
 
 def _step(trainer: Any, step: int) -> None:
