@@ -215,7 +215,9 @@ class _Resolver:
         self._dynamic_range()
         self._frames()
         self._colour()
-        self._scene()
+        self._box()
+        self._grid()
+        self._rays()
         self._gloss()
         return Resolution(self.values, tuple(self.choices), tuple(self.selection))
 
@@ -400,9 +402,9 @@ class _Resolver:
             why = f"the sensor has a colour filter ({pattern})"
         self.row("colour", channels == 3, f"{channels} channel(s)", self.why(name, why), name)
 
-    def _scene(self) -> None:
-        """Where the scene lies, and how finely it is looked at."""
-        model, recording = self.config.model, self.recording
+    def _box(self) -> None:
+        """Where the scene lies, and whether it goes on beyond."""
+        recording = self.recording
         lens = recording.camera.model
         why = "the calibration states it" if self.parser.undistort else "set by flag"
         self.row("undistortion", lens != "pinhole", lens, why, f"{DATAPARSER}.undistort")
@@ -413,7 +415,7 @@ class _Resolver:
         near, far = self._depth_range = scene_depth_range(recording, stated)
         if stated is None:
             self.values[name] = near, far
-        _, scale, _ = scene_normalisation(recording, near, far, box)
+        _, self._scale, _ = scene_normalisation(recording, near, far, box)
         if box is None:
             value = f"depths {near:.2f} m to {far:.2f} m"
             why = self.why(name, "the recording states them" if recording.depth_range else "measured from the events")
@@ -421,15 +423,18 @@ class _Resolver:
             name = f"{DATAPARSER}.box"
             value, why = f"cube of {2 * box[3]:g} m", self.why(name, "")
         self.row("box", True, value, why, name)
-        self.use("model.near_plane", lambda: near * scale)
+        self.use("model.near_plane", lambda: near * self._scale)
 
         name = "model.contraction"
         share = 0.0 if box is not None else share_beyond(recording, (near, far))
-        contracted = self.use(name, lambda: share > SHARE_BEYOND)
+        self._contracted = self.use(name, lambda: share > SHARE_BEYOND)
         why = "the box is set" if box is not None else f"{100 * share:.1f} % of the events come from beyond {far:.3g} m"
-        self.row("contraction", contracted, "space beyond the box" * contracted, self.why(name, why), name)
+        self.row("contraction", self._contracted, "space beyond the box" * self._contracted, self.why(name, why), name)
 
-        footprint = math.sqrt(near * far) / recording.camera.fx * scale
+    def _grid(self) -> None:
+        """How fine the scene is."""
+        model, (near, far) = self.config.model, self._depth_range
+        footprint = math.sqrt(near * far) / self.recording.camera.fx * self._scale
         finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
         resolution = self.use("model.max_res", lambda: min(max(finest, 2 * model.base_res), LARGEST_RESOLUTION))
         name = "model.num_levels"
@@ -437,14 +442,15 @@ class _Resolver:
         levels = self.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
         growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
         why = f"as fine as the sensor's pixels, each {growth:.2f} times as fine as the one before"
-        if model.max_res is not None:
-            why = "set by flag"
-        self.row(
-            "hash grid", True, f"{levels} levels, {model.base_res} to {resolution} cells", self.why(name, why), name
-        )
+        why = "set by flag" if model.max_res is not None else self.why(name, why)
+        self.row("hash grid", True, f"{levels} levels, {model.base_res} to {resolution} cells", why, name)
 
+    def _rays(self) -> None:
+        """Where rays are sampled, and whether all meet a surface."""
+        model, recording, (near, far) = self.config.model, self.recording, self._depth_range
         name = "model.sampling"
-        disparity = recording.camera.fx * _path_extent(recording) * (1 / near - 1 / far)
+        nearness = 1 / near - (0.0 if self._contracted else 1 / far)
+        disparity = recording.camera.fx * _path_extent(recording) * nearness
         sampling = self.use(name, lambda: "proposal" if disparity > model.num_samples else "uniform")
         value = f"{model.num_proposal_samples} + {model.num_samples} samples a ray"
         if sampling == "uniform":

@@ -95,13 +95,13 @@ class EnerfModelConfig(ModelConfig):
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before the sensor had a config of its own, too."""
+        """Reads config.yml of runs from before the sensor had a config of its own, and before contraction, too."""
         thresholds = state.pop("contrast_thresholds", None)
         if "sensor" not in state:
             state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
         if "hidden_dim_color" in state:
             state["hidden_dim_colour"] = state.pop("hidden_dim_color")
-        self.__dict__.update(state)
+        self.__dict__.update({"contraction": False, **state})
 
 
 class BoxCollider(AABBBoxCollider):

@@ -269,6 +269,12 @@ class EnerfTrainer(Trainer):
         config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
         try:
             super().train()
+        except OSError as error:  # of what Nerfstudio writes beside checkpoints, such as TensorBoard's files
+            raise SystemExit(
+                f"enerf: Training ended at step {self._trained}, since {self.base_dir} could not be written to "
+                f"({error.strerror or error}); the checkpoints there stay. Make room, and continue with ns-train "
+                f"{config.method_name} --load-config {shlex.quote(str(self.base_dir / 'config.yml'))}."
+            ) from error
         finally:
             config.max_num_iterations = total
             self._restore_signals()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import resource
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import nerfstudio.engine.trainer  # noqa: F401 - before its writer, which would import it in a circle
 import numpy as np
 import pytest
 import torch
@@ -213,3 +215,17 @@ def test_a_disk_that_is_full_at_the_start_is_one_sentence(recording: Path, tmp_p
     with full_disk(1000), pytest.raises(SystemExit, match=message):
         config.save_config()
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
+
+
+def test_a_disk_that_is_full_for_other_files_ends_training_with_the_command_that_continues(copy: Path, monkeypatch):
+    def no_room() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    config.max_num_iterations = 6
+    trainer = set_up(config)
+    monkeypatch.setattr(writer, "write_out_storage", no_room)
+    with pytest.raises(SystemExit, match=r"could not be written to \(No space left on device\); .* continue") as ended:
+        trainer.train()
+    assert "\n" not in str(ended.value) and f"--load-config {copy / 'config.yml'}" in str(ended.value)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
