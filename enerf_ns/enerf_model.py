@@ -61,8 +61,7 @@ class EnerfModelConfig(ModelConfig):
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
     """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
     sampling: Optional[Literal["proposal", "uniform"]] = None  # noqa: UP045
-    """Where samples along a ray lie: where a small network expects surfaces, or everywhere. None: everywhere where they
-    are as many as the pixels by which near and far move against each other."""
+    """Where samples along a ray lie: where a small network expects surfaces, or everywhere. None: where it does."""
     num_proposal_samples: int = 48
     """Samples of the proposal network along a ray."""
     num_samples: int = 24

@@ -341,7 +341,8 @@ class EnerfTrainer(Trainer):
     def _handle_signals(self) -> None:
         try:
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers[number] = signal.signal(number, self._interrupt) or signal.SIG_DFL
+                if signal.getsignal(number) != signal.SIG_IGN:  # as of a run in the background, which nobody interrupts
+                    self._handlers[number] = signal.signal(number, self._interrupt) or signal.SIG_DFL
         except ValueError:  # not in the main thread, to which alone signals come
             pass
 

@@ -223,9 +223,9 @@ def test_a_disk_that_is_full_for_other_files_ends_training_with_the_command_that
 
     config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
     config.max_num_iterations = 6
-    trainer = set_up(config)
+    trainer, handler = set_up(config), signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(writer, "write_out_storage", no_room)
     with pytest.raises(SystemExit, match=r"could not be written to \(No space left on device\); .* continue") as ended:
         trainer.train()
     assert "\n" not in str(ended.value) and f"--load-config {copy / 'config.yml'}" in str(ended.value)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,14 @@ from small_runs import set_up, small_config
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 
 STEPS = 6
+
+
+@pytest.fixture(autouse=True)
+def interruptible() -> Iterator[None]:
+    """Also where these tests run in the background, whose processes ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def trained(config: EnerfTrainerConfig, first: int = 0, stop_after: int | None = None, by=signal.SIGTERM) -> Any:
@@ -241,3 +250,16 @@ def test_a_checkpoint_that_is_not_there_is_one_sentence(recording: Path, tmp_pat
     with pytest.raises(SystemExit, match=r"^enerf: .*nowhere.* does not exist; give "):
         config.save_config()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_in_the_background_goes_on(recording: Path, tmp_path: Path):
+    """It ignores SIGINT, which a terminal sends to what runs in the foreground."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations = 3
+    trainer = set_up(config)
+    draw = trainer.pipeline.datamanager.next_batch
+    trainer.pipeline.datamanager.next_batch = lambda sensor: (os.kill(os.getpid(), signal.SIGINT), draw(sensor))[1]
+    trainer.train()
+    assert checkpoints(trainer) == ["step-000000002.ckpt"]
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

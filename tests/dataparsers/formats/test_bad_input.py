@@ -315,7 +315,7 @@ ESIM = [
     BadInput(
         "threshold zero",
         write("simulation.json", json.dumps({"contrast_thresholds": [0.2, 0]})),
-        ("simulation.json holds the contrast thresholds 0.2", "and 0 (", "above 0"),
+        ("simulation.json holds the contrast thresholds 0.2", "and 0 (", "from 0.001 to 10"),
     ),
     BadInput(
         "camera without focal length",
