@@ -86,9 +86,11 @@ class LeftOut:
                     torch.cuda.synchronize()
                 milliseconds.append(1e3 * (time.perf_counter() - start))
             scores.append(mean_scores(held_out_views(trainer.pipeline)[0])[0])
-        means = [statistics.mean(score[key] for score in scores) for key in ("psnr", "correlation", "depth_rmse")]
         cells = [f"{statistics.median(milliseconds):.0f}", f"{megabytes:.1f}"]
-        return f"| {name} | " + " | ".join(cells + [f"{mean:.{2 if mean > 1 else 3}f}" for mean in means]) + " |"
+        for key in ("psnr", "correlation", "depth_rmse"):  # a negative, for one, has no PSNR
+            found = [score[key] for score in scores if key in score]
+            cells.append(f"{statistics.mean(found):.3f}" if found else "-")
+        return f"| {name} | " + " | ".join(cells) + " |"
 
 
 def saved_megabytes(trainer: Any) -> float:

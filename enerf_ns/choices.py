@@ -453,7 +453,7 @@ class _Resolver:
         disparity = recording.camera.fx * _path_extent(recording) * nearness
         sampling = self.use(
             name, lambda: "proposal"
-        )  # also where these pixels are few: even samples lost 2 to 5 dB at 10
+        )  # also where these pixels are few: even samples lost 2 to 5 dB at 11
         value = f"{model.num_proposal_samples} + {model.num_samples} samples a ray"
         if sampling == "uniform":
             value = f"{model.num_samples} samples a ray, evenly spaced"

@@ -19,7 +19,8 @@ HALF = (torch.float16, torch.bfloat16)
 def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Keeps a function out of torch.autocast, and gives it float32 for every tensor in half precision that it is given.
 
-    In half precision a change of log brightness of 0.001 has an error of 0.03 (bfloat16) or 0.004 (float16).
+    On the demo after 600 steps, a density network in bfloat16 moves changes of log brightness by 0.7 % of their spread,
+    and by up to 0.029, in float16 by 0.08 %; what a young field has to tell is as small.
     """
 
     @functools.wraps(function)
