@@ -61,6 +61,7 @@ class LeftOut:
         rows |= {f"without {part}": {**everything, **off} for part, (_, off) in PARTS.items()}
         rows |= {"everything left out": nothing, "as decided": {}}
         lines = ["| | ms a step | MB a step | psnr | correlation | depth_rmse |", "|---|---|---|---|---|---|"]
+        print("\n".join(lines), flush=True)
         for name, changes in rows.items():
             lines.append(self.row(name, changes))
             print(lines[-1], flush=True)

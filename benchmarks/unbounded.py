@@ -56,8 +56,8 @@ class Unbounded:
             (self.output_dir / "path.txt").write_text(PATH)
             scene, path = str(self.output_dir / "scene.json"), self.output_dir / "path.txt"
             simulate(SimulationSettings(scene, key_frames=path, width=120, height=90, num_frames=29), recording)
-        print("| contraction | seed | train s | psnr | ssim | lpips | correlation | median depth error, m |")
-        print("|---|---|---|---|---|---|---|---|")
+        print("| contraction | seed | train s | psnr | ssim | correlation | median depth error, m |")
+        print("|---|---|---|---|---|---|---|")
         for contraction in (False, True):
             for seed in range(self.seeds):
                 settings = {
@@ -74,7 +74,7 @@ class Unbounded:
                     assert view.recorded_depth is not None
                     near = (view.recorded_depth > 0) & (view.recorded_depth < NEAR[1])
                     errors.append((view.depth - view.recorded_depth)[near].abs())
-                cells = [f"{scores.get(name, torch.nan):.3f}" for name in ("psnr", "ssim", "lpips", "correlation")]
+                cells = [f"{scores.get(name, torch.nan):.3f}" for name in ("psnr", "ssim", "correlation")]
                 cells.append(f"{float(torch.cat(errors).median()):.3f}")
                 kept = "kept" if contraction else "left out"
                 print(f"| {kept} | {seed} | {run.train_seconds:.0f} | {' | '.join(cells)} |", flush=True)
