@@ -27,8 +27,8 @@ DARKEST = 2.0 / 255.0
 brightness is logarithmic."""
 
 LOG_SIGMOID_RANGE = 4.0
-"""Largest range of log brightness for which log-sigmoid is meant: fitted to a range of 4 its rms error is below 0.001, of
-6 it is 0.09 and of 10 0.96 by `linlog`, of which it spans 5.24; the exponential's is 0.02 at 10
+"""Largest range of log brightness for which log-sigmoid is meant: fitted to a range of 4 its rms error is below 0.001,
+of 6 it is 0.09 and of 10 0.96 by `linlog`, of which it spans 5.24; the exponential's is 0.02 at 10
 (`benchmarks/dynamic_range.py`)."""
 
 LARGEST_EXPONENT = 30.0
