@@ -25,8 +25,7 @@ from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
 from enerf_ns.enerf_model import EnerfModelConfig
-from enerf_ns.events.brightness_range import log_brightness_range
-from enerf_ns.events.statistics import border_rate, silent_share
+from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.paper_selections import preset_named, selections
 from enerf_ns.sensor.response import ColourFilter, response_named
 from enerf_ns.sensor.sensor_model import GREY, thresholds_from_polarity
