@@ -478,7 +478,7 @@ class _Resolver:
             why += ", too little to tell gloss from texture"
         elif kept is None and self.probe is None:
             why += ", but nothing was trained to probe it"
-        elif kept is None:
+        elif kept is None and self.probe is not None:
             gain, error = self.probe(Resolution(self.values).applied_to(self.config))
             kept = gain > max(SMALLEST_GAIN, 2.0 * error)
             why += f", and it lowers the error of held-out pairs by {100 * gain:.1f} ± {100 * error:.1f} %"

@@ -72,7 +72,7 @@ def _errors(config: str, optimizer: str, device: str, view_direction: bool) -> F
         what = f"Probing gloss, {'with' if view_direction else 'without'} it"
         for _ in track(range(STEPS), what, console=CONSOLE, transient=True):
             adam.zero_grad()
-            sum(_losses(pipeline, held_out=False).values()).backward()
+            torch.stack([*_losses(pipeline, held_out=False).values()]).sum().backward()
             adam.step()
         torch.manual_seed(1)
         pipeline.datamanager.generator.manual_seed(1)

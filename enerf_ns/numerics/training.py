@@ -42,7 +42,8 @@ def _changed_by(spoil: Callable[[Any], None]) -> float:
         spoil(manager)
         trainer.train_iteration(1)
         changed = _different(before, _state(trainer))
-        vars(manager).pop("next_batch", None), vars(manager).pop("rays", None)
+        for name in ("next_batch", "rays"):
+            vars(manager).pop(name, None)
         trainer.train_iteration(2)
     after = _state(trainer)
     stuck = all(torch.equal(before[name], after[name]) for name in before)
