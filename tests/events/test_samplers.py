@@ -109,6 +109,15 @@ def test_every_partner_is_decoded_once(max_distance: int, equal_stamps: bool) ->
     assert set(rows(drawn)) == set(expected)
 
 
+def assert_as_likely(pairs: EventBatch, expected: list[tuple[int, int, int]], uniform_over: str) -> None:
+    """All of the expected pairs are drawn and no other, each pair as often, or each pixel (chi-square test)."""
+    drawn = Counter(rows(pairs))
+    assert set(drawn) == set(expected)
+    per_pixel = Counter(pixel for pixel, _, _ in expected)
+    weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
+    assert chisquare([drawn[pair] for pair in expected], len(pairs) * weights / weights.sum()).pvalue > 1e-3
+
+
 @pytest.mark.parametrize("equal_stamps", [False, True])
 @pytest.mark.parametrize("uniform_over", ["pairs", "pixels"])
 @pytest.mark.parametrize("mode", MODES)
@@ -122,12 +131,7 @@ def test_pairs_are_uniform_and_count_their_events(mode, uniform_over, equal_stam
     assert pairs.pixels.device.type == device
     assert pairs.num_silent == 0 and {column.dtype for column in pairs.columns} == {torch.int64}
     assert_counts_are_right(pairs, pixels)
-
-    drawn = Counter(rows(pairs))
-    assert set(drawn) == set(expected)
-    per_pixel = Counter(pixel for pixel, _, _ in expected)
-    weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
-    assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
+    assert_as_likely(pairs, expected, uniform_over)
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 7, 2**20])
@@ -146,11 +150,7 @@ def test_no_pair_starts_or_ends_in_a_gap(mode, equal_stamps: bool, uniform_over,
     assert sampler.num_pairs == len(expected)
     pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(1))
     assert_counts_are_right(pairs, pixels)
-    drawn = Counter(rows(pairs))
-    assert set(drawn) == set(expected)
-    per_pixel = Counter(pixel for pixel, _, _ in expected)
-    weights = np.array([1.0 if uniform_over == "pairs" else 1.0 / per_pixel[pixel] for pixel, _, _ in expected])
-    assert chisquare([drawn[pair] for pair in expected], 20_000 * weights / weights.sum()).pvalue > 1e-3
+    assert_as_likely(pairs, expected, uniform_over)
 
 
 @pytest.mark.parametrize("mode", MODES)
