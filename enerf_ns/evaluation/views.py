@@ -62,11 +62,14 @@ class HeldOutView:
 
 
 @torch.no_grad()
-def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict[str, Score]]:
-    """Render every held-out frame; align brightness over all of them where the field learnt from events alone.
+def held_out_views(
+    pipeline: RenderingPipeline, numbers: Sequence[int] | None = None
+) -> tuple[list[HeldOutView], dict[str, Score]]:
+    """Render held-out frames; align brightness over all of them where the field learnt from events alone.
 
     Args:
         pipeline: With a trained field.
+        numbers: Of the held-out frames, from 0. None: all.
 
     Returns:
         The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
@@ -78,7 +81,8 @@ def held_out_views(pipeline: RenderingPipeline) -> tuple[list[HeldOutView], dict
     dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
     views: list[HeldOutView] = []
     start = time.perf_counter()
-    for index in track(range(len(dataset)), "Rendering held-out frames", console=CONSOLE, transient=True):
+    chosen = range(len(dataset)) if numbers is None else numbers
+    for index in track(chosen, "Rendering held-out frames", console=CONSOLE, transient=True):
         data = dataset[index]
         camera = dataset.cameras[index : index + 1].to(pipeline.device)
         rays = camera.generate_rays(camera_indices=0, keep_shape=True)
