@@ -218,9 +218,29 @@ class EventRecording:
 
     def instants(self, number: int) -> Int64[np.ndarray, " number"]:
         """Instants (ns) spread evenly over the `stretches`, at least 2, from their first to their last."""
+        return self._instants_at(evenly_spaced(0, self._num_instants - 1, number))
+
+    def spans(self, number: int, share: float) -> Int64[np.ndarray, "number 2"]:
+        """First and last instant (ns) of spans, equally long and spread evenly over the `stretches`.
+
+        Args:
+            number: Of the spans.
+            share: Of the instants of the stretches that all spans have together, above 0 and at most 1.
+        """
+        length = max(int(share * self._num_instants) // number, 1)
+        middles = (2 * np.arange(number) + 1) * self._num_instants // (2 * number)
+        begins = (middles - length // 2).clip(0)
+        return np.column_stack([self._instants_at(begins), self._instants_at(begins + length - 1)])
+
+    @property
+    def _num_instants(self) -> int:
+        begins, ends = self.stretches.T
+        return int((ends - begins + 1).sum())
+
+    def _instants_at(self, places: Int64[np.ndarray, " places"]) -> Int64[np.ndarray, " places"]:
+        """Instants (ns) of the stretches by their number, from 0."""
         begins, ends = self.stretches.T
         after = np.cumsum(ends - begins + 1)
-        places = evenly_spaced(0, after[-1] - 1, number)
         return places + (ends + 1 - after)[np.searchsorted(after, places, "right")]
 
     def in_left_out_gaps(self, times: Int64[np.ndarray, " times"]) -> Bool[np.ndarray, " times"]:
@@ -320,6 +340,13 @@ def _without_lenses(recording: EventRecording) -> EventRecording:
     frames = {kind: getattr(recording, kind) for kind in kinds}
     frames = {kind: value and replace(value, camera=value.camera.without_lens()) for kind, value in frames.items()}
     return replace(recording, camera=recording.camera.without_lens(), **frames)
+
+
+def overlaps(one: Int64[np.ndarray, "ones 2"], other: Int64[np.ndarray, "others 2"]) -> Int64[np.ndarray, "overlaps 2"]:
+    """First and last instant of each part of time that lies in both, each in order and apart."""
+    begins = np.maximum(one[:, None, 0], other[:, 0])
+    ends = np.minimum(one[:, None, 1], other[:, 1])
+    return np.stack([begins, ends], axis=-1)[begins <= ends]
 
 
 def left_out(dropped: int, total: int, what: str) -> str:

@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
-from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+from enerf_ns.enerf_datamanager import HELD_OUT_SPANS, EnerfDataManagerConfig
 from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
@@ -268,6 +268,10 @@ class _Resolver:
     def _events(self) -> None:
         """Which pairs are drawn."""
         data, defaults, recording = self.config.datamanager, self.config.defaults, self.recording
+        share = data.held_out_events
+        value = f"{100 * share:.3g} % of the time, in {HELD_OUT_SPANS} spans" if share else ""
+        why = "their correlation is measured" if share else "the correlation of events is that of training pairs"
+        self.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
+from jaxtyping import Int64
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -22,10 +23,10 @@ from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_d
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording import EventRecording, Frames, overlaps
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
-from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import EventPairSampler, HeldOutPairSampler, SilentPixelSampler
 from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.ray_samplers import PairedRayBundle
 from enerf_ns.sensor.sensor_model import SensorModel
@@ -42,6 +43,9 @@ EventDataParserUnion = OmitSubcommandPrefixes[
 
 DIRECTIONS_NORM = "directions_norm"
 """Name that Nerfstudio has among the metadata of rays for the length along each of one unit along the optical axis."""
+
+HELD_OUT_SPANS = 8
+"""Number of spans of time whose events are kept from training."""
 
 
 @dataclass
@@ -69,10 +73,17 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     paper for enerf-paper. 0: silent pixels are not searched."""
     silence_ms: Optional[float] = None  # noqa: UP045
     """Shortest silence of a pixel that counts. None: 20, or as the preset."""
+    held_out_events: float = 0.02
+    """Share of the recording's time, in 8 equal spans spread evenly over it, at which no pair starts or ends: the
+    correlation of events is measured there. 0: none, and it is measured over training pairs."""
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
     """Pixels of frames drawn at each step, where the field learns from frames. None: 1024, or as the paper for
     enerf-paper."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Reads config.yml of runs from before events were held out, too."""
+        self.__dict__.update({"held_out_events": 0.0, **state})
 
 
 class EnerfDataManager(VanillaDataManager[EventDataset]):
@@ -88,7 +99,11 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         self.generator = torch.Generator(self.device).manual_seed(torch.initial_seed() % 2**63)
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, config.train_num_rays_per_batch)
         if self.test_mode == "val" and "events" in config.supervision:
-            _ = self.pair_sampler, self.silent_sampler  # so that what cannot be drawn is found before training
+            _ = (
+                self.pair_sampler,
+                self.silent_sampler,
+                self.held_out_pair_sampler,
+            )  # so that what cannot be drawn is found before training
 
     def setup_eval(self) -> None:
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
@@ -102,6 +117,12 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def recording(self) -> EventRecording:
         """The recording that is learnt from."""
         return self.train_dataset.recording
+
+    @property
+    def held_out_spans(self) -> Int64[np.ndarray, "spans 2"]:
+        """First and last instant (ns) of each span of time whose events are kept from training."""
+        share = self.config.held_out_events
+        return self.recording.spans(HELD_OUT_SPANS, share) if share else np.zeros((0, 2), np.int64)
 
     @cached_property
     def index(self) -> EventIndex:
@@ -117,6 +138,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """
         config = self.config
         assert config.pair_mode is not None
+        first, last = self.recording.span
+        around = np.concatenate([[first], (self.held_out_spans + [-1, 1]).flatten(), [last]]).reshape(-1, 2)
         try:
             return EventPairSampler(
                 self.index,
@@ -124,10 +147,20 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 max_distance=config.max_pair_distance,
                 window_ns=round(config.window_ms * 1e6),
                 uniform_over=config.uniform_over,
-                stretches=self._stretches,
+                stretches=self._parts(overlaps(self.recording.stretches, around)),
             )
         except ValueError as error:
             raise FlagError(f"{self.recording.path}: {error}") from error
+
+    @cached_property
+    def held_out_pair_sampler(self) -> HeldOutPairSampler | str:
+        """Draws pairs of events that both are held out, as far apart as those of the training; or why there is none."""
+        spans = torch.from_numpy(overlaps(self.recording.stretches, self.held_out_spans)).to(self.device)
+        try:
+            successors = self.config.pair_mode == "successor"
+            return HeldOutPairSampler(self.index, spans, 1 if successors else self.config.max_pair_distance)
+        except ValueError as error:
+            return str(error)
 
     @cached_property
     def silent_sampler(self) -> SilentPixelSampler | None:
@@ -137,7 +170,14 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         assert self.config.silence_ms is not None
         silence = round(self.config.silence_ms * 1e6)
         span = index_events(self.recording).span
-        return SilentPixelSampler(self.index, *span, silence, silence, self._stretches)
+        return SilentPixelSampler(
+            self.index,
+            *span,
+            silence,
+            silence,
+            self._parts(self.recording.stretches),
+            torch.from_numpy(self.held_out_spans).to(self.device),
+        )
 
     @cached_property
     def event_camera(self) -> PosedCamera:
@@ -223,11 +263,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         pairs = (config.event_pairs or 0) + (config.silent_pairs or 0) if "events" in config.supervision else 0
         return 2 * pairs + ((config.train_num_rays_per_batch or 0) if "frames" in config.supervision else 0)
 
-    @property
-    def _stretches(self) -> Tensor | None:
-        """First and last instant (ns) of each part of the recording that is used; None where that is its span."""
-        stretches, span = self.recording.stretches, self.recording.span
-        return None if stretches.tolist() == [[*span]] else torch.from_numpy(stretches).to(self.device)
+    def _parts(self, stretches: Int64[np.ndarray, "stretches 2"]) -> Tensor | None:
+        """First and last instant (ns) of parts of the recording, for samplers; None where they are its span."""
+        return None if stretches.tolist() == [[*self.recording.span]] else torch.from_numpy(stretches).to(self.device)
 
     @property
     def _frames(self) -> Frames:

@@ -22,6 +22,7 @@ from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views, save_pictures
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ffmpeg import make_ffmpeg_available
+from enerf_ns.stopwatch import Stopwatch
 from enerf_ns.supervision.event_supervision import brightness_change
 
 
@@ -77,6 +78,11 @@ class EnerfPipeline(VanillaPipeline):
     last_step: TrainStep
     """The last training step, once there was one."""
 
+    def __init__(self, config: EnerfPipelineConfig, device: str, **kwargs: Any):
+        super().__init__(config, device, **kwargs)
+        self.stopwatch = Stopwatch(device)
+        """Is told where each part of a step ends."""
+
     @property
     def model(self) -> EnerfModel:
         return super().model  # type: ignore
@@ -85,11 +91,16 @@ class EnerfPipeline(VanillaPipeline):
         """Outputs, losses and metrics of the next batch."""
         sensor = self.model.sensor
         batch = self.datamanager.next_batch(sensor)
-        outputs = self._model(self.datamanager.rays(batch, sensor))
+        self.stopwatch.lap("draw")
+        rays = self.datamanager.rays(batch, sensor)
+        self.stopwatch.lap("rays")
+        outputs = self._model(rays)
+        self.stopwatch.lap("render")
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         detached = {name: loss.detach() for name, loss in losses.items()}
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
+        self.stopwatch.lap("losses")
         return outputs, losses, metrics
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
@@ -105,12 +116,15 @@ class EnerfPipeline(VanillaPipeline):
         """Linear correlation of rendered and measured changes of log brightness over random event pairs, or why there
         is none.
 
-        What can be said of a field whose recording has no frames; the pairs are drawn from those of the training.
+        What can be said of a field whose recording has no frames. The pairs are those of the events that are held out
+        (`held_out_events`); where none are, those of the training.
         """
-        self.eval()
         manager, sensor = self.datamanager, self.model.sensor
-        generator = torch.Generator(self.device).manual_seed(0)
-        batch = manager.pair_sampler.sample(num_pairs, generator)
+        sampler = manager.held_out_pair_sampler if manager.config.held_out_events else manager.pair_sampler
+        if isinstance(sampler, str):
+            return sampler
+        self.eval()
+        batch = sampler.sample(num_pairs, torch.Generator(self.device).manual_seed(0))
         rays = manager.event_rays(batch, sensor).reshape((2, num_pairs))
         start, end = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
         self.train()

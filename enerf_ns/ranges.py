@@ -22,6 +22,7 @@ COUNT, WEIGHT, LEARNING_RATE = (0, 10**9), (0.0, 1e6), (1e-12, 1.0)
 
 RANGES: dict[str, tuple[float, float]] = {
     "max_num_iterations": (1, MOST_STEPS),
+    "evaluation_share": (0.0, 1.0),
     "steps_per_save": (1, MOST_STEPS),
     "steps_per_eval_batch": (0, MOST_STEPS),  # 0: never
     "steps_per_eval_image": (0, MOST_STEPS),
@@ -60,6 +61,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_pair_distance": (1, 10**6),
     "window_ms": (1e-6, 1e9),  # from 1 ns
     "silent_pairs": (0, MOST_DRAWS),
+    "held_out_events": (0.0, 0.5),
     "silence_ms": (2e-6, 1e9),  # from 2 ns, which two instants need
     "train_num_rays_per_batch": (1, MOST_DRAWS),
     "eval_num_rays_per_batch": (1, MOST_DRAWS),

@@ -202,6 +202,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
     """The flag of each row is one of the config; set to each answer, the row says so and that a flag did it."""
     forced: dict[str, tuple[Any, Any]] = {
         "pose gaps": (True, False),
+        "held-out events": (0.1, 0.0),
         "event loss": ("events", "frames"),
         "silent pixels": (7, 0),
         "threshold per polarity": ((0.2, 0.3), (0.2, 0.2)),

@@ -51,6 +51,46 @@ def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path
     assert "\n" not in str(error.value)
 
 
+def held_out(times: torch.Tensor, share: float) -> torch.Tensor:
+    """Which times (ns) lie in one of eight spans, each in the middle of an eighth of the recording's 0.1 s."""
+    return ((times * 8 / 1e8) % 1 - 0.5).abs() < share / 2 + 1e-6
+
+
+@pytest.mark.parametrize("mode", ["successor", "partner", "window"])
+def test_nothing_is_learnt_from_events_that_are_held_out(recording: Path, tmp_path: Path, mode: str):
+    changes = dict(data__pair_mode=mode, data__window_ms=20.0, data__event_pairs=5000, data__silent_pairs=5000)
+    pipeline = set_up(small_config(recording, tmp_path, data__held_out_events=0.2, **changes)).pipeline
+    manager = pipeline.datamanager
+    events = manager.next_batch(pipeline.model.sensor).events
+    for kind in (events.silent, events.fired):
+        ends = torch.cat([events.start[kind], events.end[kind]])
+        assert len(ends) == 10_000 and not held_out(ends, 0.2 - 4e-6).any()
+        assert len((ends * 8 // 10**8).unique()) == 8
+    between = (events.start * 8 + 5 * 10**7) // 10**8 < (events.end * 8 + 5 * 10**7) // 10**8
+    assert between[events.silent].any(), "silence goes on over what is held out"
+    assert between[events.fired].any() == (mode != "window")
+    times = manager.index.times
+    chosen = manager.held_out_pair_sampler.sample(5000, torch.Generator().manual_seed(0))
+    ends = torch.cat([chosen.start, chosen.end])
+    assert held_out(ends, 0.2).all() and held_out(times, 0.2).sum() > len(ends.unique()) > 50
+
+
+def test_without_held_out_events_the_correlation_is_that_of_training_pairs(recording: Path, tmp_path: Path):
+    pipeline = set_up(small_config(recording, tmp_path, data__held_out_events=0.0)).pipeline
+    manager = pipeline.datamanager
+    drawn = []
+    sample = manager.pair_sampler.sample
+    manager.pair_sampler.sample = lambda *arguments: drawn.append(sample(*arguments)) or drawn[-1]
+    assert isinstance(pipeline.event_correlation(256), float) and len(drawn[0]) == 256
+    fired = torch.cat([drawn[0].start, drawn[0].end])
+    assert held_out(fired, 0.2).any()
+
+
+def test_too_few_events_to_hold_out_are_a_reason_and_no_error(recording: Path, tmp_path: Path):
+    pipeline = set_up(small_config(recording, tmp_path, data__held_out_events=1e-4)).pipeline
+    assert pipeline.event_correlation().startswith("no pixel fired twice, 10 events apart or less, in the time")
+
+
 def test_tools_that_look_at_a_scene_get_pixels_of_the_train_cameras(recording: Path, tmp_path: Path):
     """As many as ns-export asks for, evenly over frames, rows and columns."""
     manager = set_up(small_config(recording, tmp_path)).pipeline.datamanager

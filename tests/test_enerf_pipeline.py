@@ -16,7 +16,11 @@ from enerf_ns.sensor.response import linlog, luma
 @pytest.fixture(scope="module")
 def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     config = small_config(
-        recording, tmp_path_factory.mktemp("outputs"), data__supervision="events+frames", data__silent_pairs=16
+        recording,
+        tmp_path_factory.mktemp("outputs"),
+        data__supervision="events+frames",
+        data__silent_pairs=16,
+        data__held_out_events=0.2,
     )
     return set_up(config).pipeline
 
@@ -30,10 +34,10 @@ def test_losses_of_training_have_gradients_and_those_of_evaluation_have_none(pip
 
 
 def test_the_correlation_of_events_is_that_of_what_is_rendered(pipeline: Any):
-    """With pairs drawn as for training, by a generator of its own, so that it is the same each time."""
+    """Over pairs that are held out, by a generator of its own, so that it is the same each time."""
     found = pipeline.event_correlation(300)
     assert pipeline.event_correlation(300) == found
-    pairs = pipeline.datamanager.pair_sampler.sample(300, torch.Generator().manual_seed(0))
+    pairs = pipeline.datamanager.held_out_pair_sampler.sample(300, torch.Generator().manual_seed(0))
     levels = []
     for times in (pairs.start, pairs.end):
         rays = pipeline.datamanager.event_camera.rays(pairs.pixels, times)

@@ -119,7 +119,7 @@ def test_without_gaps_there_is_a_row_and_nothing_else(recording: Path, tmp_path:
     whole = read_recording(recording)
     assert len(whole.pose_gaps) == 0 and whole.stretches.tolist() == [list(whole.span)]
     assert not any("gap" in note for note in (*whole.notes, *index_events(whole).notes))
-    assert set_up(config).pipeline.datamanager._stretches is None
+    assert set_up(config).pipeline.datamanager._parts(whole.stretches) is None
 
 
 @pytest.mark.parametrize("held_out", [False, True])

@@ -30,8 +30,8 @@ class EventPairSampler:
     Between the events of other pairs the pixel is blind too, and what changes meanwhile is missing from the sum of
     their events: these pairs are approximate.
 
-    Where `stretches` leave gaps, the instants within these are none: the instants before and after are neighbours, and
-    of their pair, which counts the events of the gap, what was said of the other pairs holds. Windows end at gaps.
+    Where `stretches` leave time out, the instants within it are none: the instants before and after are neighbours, and
+    of their pair, which counts the events between, what was said of the other pairs holds. Windows end there.
 
     Args:
         index: The events; batches come out on its device.
@@ -72,12 +72,9 @@ class EventPairSampler:
             self._starts = _places(instants)
             self._pair_offsets = torch.searchsorted(self._starts, index.offsets.int()).long()
         else:
-            self._instants = None if instants.all() else _places(instants)
-            self._offsets = (
-                index.offsets
-                if self._instants is None
-                else torch.searchsorted(self._instants, index.offsets.int()).long()
-            )
+            skipped = _places(instants.logical_not_())
+            self._offsets = index.offsets - torch.searchsorted(skipped, index.offsets.int())
+            self._before_skipped = skipped.sub_(torch.arange(len(skipped), dtype=skipped.dtype, device=skipped.device))
             count = self._offsets.diff()
             distances = (count - 1).clamp(min=0, max=self.max_distance)
             pairs = distances * (2 * count - distances - 1) // 2
@@ -85,7 +82,7 @@ class EventPairSampler:
         self.num_pairs = int(self._pair_offsets[-1])
         if self.num_pairs == 0:
             where = f" within a window of {window_ns * 1e-6:g} ms" if self.window else ""
-            where += " outside the gaps of the poses" if stretches is not None else ""
+            where += " in the time that is looked at" if stretches is not None else ""
             raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
         self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
 
@@ -120,10 +117,47 @@ class EventPairSampler:
         second_half = column >= count - row - 1
         distance = torch.where(second_half, largest - row, row + 1)
         start = first + torch.where(second_half, column - (count - row - 1), column)
-        end = start + distance
-        if self._instants is None:
-            return start, end
-        return self._instants[start].long(), self._instants[end].long()
+        return self._event(start), self._event(start + distance)
+
+    def _event(self, instants: Tensor) -> Tensor:
+        """Numbers of the events that are the instants with these numbers, counted over all pixels."""
+        return instants + torch.searchsorted(self._before_skipped, instants.int(), right=True)
+
+
+class HeldOutPairSampler:
+    """Draws pairs of events of one pixel that both lie within spans of time, whose events are kept from training.
+
+    All pairs of at most `max_distance` events of the pixel are equally likely; as of `EventPairSampler`, no pair has zero
+    length. Events between two spans count, where they are so few.
+
+    Args:
+        index: The events; batches come out on its device.
+        spans: First and last time (ns) of each span, in order and apart.
+        max_distance: At least 1.
+
+    Raises:
+        ValueError: There is no pair to draw.
+    """
+
+    def __init__(self, index: EventIndex, spans: Int64[Tensor, "spans 2"], max_distance: int):
+        self.index = index
+        held_out = _places(_last_of_each(index, None, spans)).long()
+        pixels = torch.searchsorted(index.offsets, held_out, right=True) - 1
+        pairs = [held_out.new_zeros((0, 3))]
+        for distance in range(1, min(max_distance + 1, len(held_out))):
+            start, end, pixel = held_out[:-distance], held_out[distance:], pixels[distance:]
+            chosen = (pixels[:-distance] == pixel) & (end - start <= max_distance)
+            pairs.append(torch.stack([pixel, start, end], dim=-1)[chosen])
+        self._pairs = torch.cat(pairs).int()
+        if not len(self._pairs):
+            raise ValueError(f"no pixel fired twice, {max_distance} events apart or less, in the time that is held out")
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
+        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index."""
+        chosen = torch.randint(len(self._pairs), (batch_size,), generator=generator, device=self._pairs.device)
+        pixels, start, end = self._pairs[chosen].long().T
+        on = (self.index.positives[end] - self.index.positives[start]).long()
+        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
 
 
 class SilentPixelSampler:
@@ -132,7 +166,7 @@ class SilentPixelSampler:
     A pixel is drawn uniformly over the sensor, hot pixels left out, and an instant uniformly over the recording, or its
     stretches; the silent interval around it is bounded by the pixel's neighbouring events, or the ends of the recording
     or of the stretch, and begins when the pixel can see again. From an interval at least `min_duration_ns` long, two
-    instants are drawn uniformly, at most `max_duration_ns` apart and never at an event.
+    instants are drawn uniformly, at most `max_duration_ns` apart, never at an event and never within `held_out`.
 
     Args:
         index: The events; batches come out on its device.
@@ -140,6 +174,7 @@ class SilentPixelSampler:
         min_duration_ns: At least 1.
         max_duration_ns: At least 2.
         stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+        held_out: First and last time (ns) of spans at which no pair starts or ends, in order and apart.
 
     Raises:
         ValueError: A duration is shorter than its minimum, or no stretch lies between start and end.
@@ -155,6 +190,7 @@ class SilentPixelSampler:
         min_duration_ns: int,
         max_duration_ns: int,
         stretches: Int64[Tensor, "stretches 2"] | None = None,
+        held_out: Int64[Tensor, "spans 2"] | None = None,
     ):
         if min_duration_ns < 1 or max_duration_ns < 2:
             raise ValueError(
@@ -176,6 +212,7 @@ class SilentPixelSampler:
             begins, ends = begins[used], ends[used]
             after = (ends - begins + 1).cumsum(0)
             self._stretches = begins, ends, after, int(after[-1])
+        self._held_out = index.offsets.new_zeros((0, 2)) if held_out is None else held_out
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
@@ -197,11 +234,12 @@ class SilentPixelSampler:
         if len(pixels):
             again = torch.arange(batch_size, device=pixels.device) % len(pixels)
             pixels, begin, end = pixels[again], begin[again], end[again]
-        instants = end - begin + 1
+        first = begin - self._held_out_before(begin)
+        instants = self._not_held_out(begin, end)
         one = _randint(instants, generator)
         other = _randint(instants - 1, generator)
         other += other >= one
-        start, end = begin + torch.minimum(one, other), begin + torch.maximum(one, other)
+        start, end = (self._instant(first + place) for place in (torch.minimum(one, other), torch.maximum(one, other)))
         none = torch.zeros_like(pixels)
         return EventBatch(pixels, start, end, none, none, num_silent=len(pixels))
 
@@ -220,7 +258,24 @@ class SilentPixelSampler:
         usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
         end = torch.minimum(end, instant + self.max_duration_ns // 2)
+        usable &= self._not_held_out(begin, end) >= 2
         return pixels[usable], begin[usable], end[usable]
+
+    def _held_out_before(self, times: Tensor) -> Tensor:
+        """How much of the time before each time is held out, ns."""
+        begins, ends = self._held_out.T
+        return (times[:, None] - begins).clamp(min=0).minimum(ends + 1 - begins).sum(dim=-1)
+
+    def _not_held_out(self, begin: Tensor, end: Tensor) -> Tensor:
+        """Number of instants from begin to end, both included, that are not held out."""
+        return end + 1 - self._held_out_before(end + 1) - (begin - self._held_out_before(begin))
+
+    def _instant(self, places: Tensor) -> Tensor:
+        """Instants that are not held out, of which as many lie before, from time 0 on, as the places say."""
+        begins = self._held_out[:, 0].contiguous()
+        passed = torch.searchsorted(begins - self._held_out_before(begins), places, right=True)
+        lengths = self._held_out.diff(dim=1)[:, 0] + 1
+        return places + torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])[passed]
 
     def _instants(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor | int, Tensor | int]:
         """Instants drawn at random, and the first and the last instant of the stretches that they lie in."""

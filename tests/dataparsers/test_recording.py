@@ -11,7 +11,7 @@ from recordings import HEIGHT, WIDTH
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording import EventRecording, Events, Frames, overlaps
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 20.0, 12.0, 9.0)
@@ -71,6 +71,32 @@ def test_stretches_are_what_the_gaps_leave_of_the_span(time_range: tuple[float, 
     assert kept.stretches.tolist() == [[start * 1_000_000, end * 1_000_000]] and kept.span == chosen.span
     assert (kept.pose_gaps == chosen.pose_gaps).all() and not kept.in_left_out_gaps(np.arange(0, 10**9, 10**6)).any()
     assert kept is whole.selected(time_range, False, True) is chosen.selected(time_range, False, True) or time_range
+
+
+@pytest.mark.parametrize("share", [1e-7, 0.05, 0.5])
+def test_spans_are_equal_and_evenly_spread_over_the_stretches(share: float):
+    """Also where one reaches over a gap; by the time that is used within each and before each."""
+    whole = with_gaps(*PIECES)
+    spans = whole.spans(8, share)
+    total = sum(last + 1 - first for first, last in whole.stretches.tolist())
+    assert (spans[1:, 0] > spans[:-1, 1]).all() and not whole.in_left_out_gaps(spans.flatten()).any()
+
+    def used(first: int, last: int) -> int:
+        return sum(max(min(last, b) + 1 - max(first, a), 0) for a, b in whole.stretches.tolist())
+
+    for i, (first, last) in enumerate(spans.tolist()):
+        assert used(first, last) == int(share * total) // 8
+        middle = used(0, first - 1) + used(first, last) / 2
+        assert middle == pytest.approx((i + 0.5) / 8 * total, abs=1)
+
+
+def test_what_lies_in_both():
+    """By looking at every instant."""
+    one, other = [(0, 3), (5, 5), (7, 20), (25, 30)], [(2, 8), (10, 10), (12, 26), (31, 40)]
+    inside = [{t for a, b in parts for t in range(a, b + 1)} for parts in (one, other)]
+    found = overlaps(np.array(one), np.array(other))
+    assert [t for a, b in found.tolist() for t in range(a, b + 1)] == sorted(inside[0] & inside[1])
+    assert overlaps(np.array(one), np.zeros((0, 2), np.int64)).shape == (0, 2)
 
 
 @pytest.mark.parametrize(

@@ -37,4 +37,5 @@ def run_without_frames(recording: Path) -> Run:
     folder = recording.with_name("without_frames")
     shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
     changes = {**SMALL, "pipeline.datamanager.dataparser.held_out_every": 16}
+    changes["pipeline.datamanager.held_out_events"] = 0.2  # of so few events
     return train(method_config("enerf", folder, recording.parent / "runs", changes))

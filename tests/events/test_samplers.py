@@ -15,7 +15,7 @@ from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.events import samplers as event_sampler
 from enerf_ns.events.batch import EventBatch
-from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import EventPairSampler, HeldOutPairSampler, SilentPixelSampler
 from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
 
 WIDTH, HEIGHT = 5, 4
@@ -153,10 +153,39 @@ def test_no_pair_starts_or_ends_in_a_gap(mode, equal_stamps: bool, uniform_over,
     assert_as_likely(pairs, expected, uniform_over)
 
 
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize("max_distance", [1, 3, 30])
+def test_held_out_pairs_have_both_ends_in_the_spans(max_distance: int, equal_stamps: bool, device: str) -> None:
+    """All of them that are so few events apart, each as likely as the others, by loops."""
+    pixels = recording(equal_stamps)
+    expected = []
+    for pixel, events in pixels.items():
+        times = [t for t, _ in events]
+        instants = sorted({t for t in times if stretch_of(t) is not None})
+        expected += [
+            (pixel, start, end)
+            for start in instants
+            for end in instants
+            if start < end and sum(start < t <= end for t in times) <= max_distance
+        ]
+    assert any(stretch_of(start) != stretch_of(end) for _, start, end in expected)
+    sampler = HeldOutPairSampler(index_of(pixels, device), torch.tensor(STRETCHES, device=device), max_distance)
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(1))
+    assert_counts_are_right(pairs, pixels)
+    assert_as_likely(pairs, expected, "pairs")
+
+
+def test_events_that_are_held_out_one_a_pixel_make_no_pair() -> None:
+    index = index_of({1: [(10, 1), (300, 1)], 2: [(20, 1)], 3: [(240, 1), (250, -1)]})
+    for spans in (STRETCHES, []):
+        with pytest.raises(ValueError, match="no pixel fired twice, 3 events apart or less"):
+            HeldOutPairSampler(index, torch.tensor(spans, dtype=torch.int64).reshape(-1, 2), 3)
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_events_in_gaps_alone_make_no_pair(mode) -> None:
     index = index_of({1: [(t, 1) for t in range(200, 330)], 2: [(10, 1)]})
-    with pytest.raises(ValueError, match="outside the gaps of the poses, so there is no pair"):
+    with pytest.raises(ValueError, match="in the time that is looked at, so there is no pair"):
         EventPairSampler(index, mode, stretches=torch.tensor(STRETCHES))
 
 
@@ -389,6 +418,26 @@ def test_silent_pixels_are_drawn_in_proportion_to_their_silence(refractory: int)
     assert not drawn[silence == 0].any()
     expected = silence[silence > 0] * (20_000 / silence.sum())
     assert chisquare(drawn[silence > 0], expected).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("refractory", [0, 25])
+def test_silent_pairs_start_and_end_outside_of_what_is_held_out(refractory: int, device: str) -> None:
+    """At all other instants of a silence alike, also where it spans what is held out; none where it lies within."""
+    pixels = {pixel: [] for pixel in range(WIDTH * HEIGHT)} | {0: [(199, 1), (240, 1), (330, -1)]}
+    spans = [(200, 329), (400, 449), (600, 600)]
+    held_out = {t for first, last in spans for t in range(first, last + 1)}
+    sampler = SilentPixelSampler(
+        index_of(pixels, device), START, END, 20, 5000, held_out=torch.tensor(spans, device=device)
+    )
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(0), refractory)
+    assert len(pairs) == 20_000
+    ends = Counter()
+    for pixel, start, end in rows(pairs):
+        assert start < end and not held_out & {start, end}
+        assert pixel or not any(start - max(refractory, 1) < t <= end for t, _ in pixels[0])
+        ends.update((start, end) if pixel else ())
+    assert set(ends) == set(range(START, END + 1)) - held_out
+    assert chisquare([*ends.values()]).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(("start", "end"), [(START, END), (0, 2500), (250, 480)])
