@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import shlex
 import signal
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +18,6 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.table import Table
 from torch import Tensor
 
 from enerf_ns.checkpoints import (
@@ -31,13 +29,11 @@ from enerf_ns.checkpoints import (
     set_random_state,
     write_checkpoint,
 )
-from enerf_ns.choices import Choice, resolve
+from enerf_ns.choices import resolve
 from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence
 from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
 from enerf_ns.guarded_steps import (
     LEARNING_CHECKED_EVERY,
@@ -50,6 +46,7 @@ from enerf_ns.guarded_steps import (
 )
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
+from enerf_ns.tables import choices_table, recording_table
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
@@ -396,53 +393,3 @@ class EnerfTrainer(Trainer):
 
 def _say(sentence: str) -> None:
     CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
-
-
-def recording_table(config: EnerfTrainerConfig) -> Table:
-    """What the recording of a resolved config holds."""
-    recording = config.recording()
-    index, camera = index_events(recording), recording.camera
-    first, last = index.span
-    seconds = max(last - first, 1) * 1e-9
-    parser = config.pipeline.resolution.applied_to(config.pipeline).datamanager.dataparser
-    depth = parser.depth_range
-    rows = {
-        "folder": f"{recording.path} ({recording.format})",
-        "events": f"{len(index):,}, {100 * index.num_positive / len(index):.0f} % on",
-        "span": f"{seconds:.2f} s",
-        "rate": f"{len(index) / seconds / 1e6:.2f} million events/s, "
-        f"{len(index) / (camera.width * camera.height):.1f} a pixel",
-        "sensor": f"{camera.width} x {camera.height}, {camera.model}",
-        "poses": f"{len(recording.trajectory.times):,}",
-    }
-    for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
-        if frames is None:
-            rows[name] = "none"
-            continue
-        depth_note = ", with depth" if frames.depth_filenames else ""
-        rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
-    if depth is not None:
-        _, scale, box = scene_normalisation(recording, *depth, parser.box)
-        rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
-        rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
-    table = Table(title="Recording", show_header=False, title_justify="left")
-    for name, value in rows.items():
-        table.add_row(name, value)
-    for note in (*recording.notes, *index.notes):
-        table.add_row("note", f"[yellow]{note}[/yellow]")
-    for problem in find_problems(recording, depth):
-        table.add_row("[red]problem[/red]", f"[red]{problem.what}[/red] {problem.advice}")
-    return table
-
-
-def choices_table(choices: Sequence[Choice]) -> Table:
-    """What is kept and what is left out, why, and by which flag it is forced."""
-    prefix = "--pipeline."
-    table = Table(title="Parts of the method", caption=f"forced by {prefix}FLAG VALUE, those of event-data at the end")
-    table.title_justify = table.caption_justify = "left"
-    for column in ("part", "", "what", "why", "flag"):
-        table.add_column(column)
-    for choice in choices:
-        kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
-        table.add_row(choice.part, kept, choice.value, choice.why, f"[dim]{choice.flag.removeprefix(prefix)}[/dim]")
-    return table

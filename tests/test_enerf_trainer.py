@@ -14,8 +14,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
 
 from enerf_ns.enerf_config import enerf
-from enerf_ns.enerf_trainer import choices_table, recording_table
 from enerf_ns.sensor.response import Linlog
+from enerf_ns.tables import choices_table, recording_table
 
 
 def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, monkeypatch):

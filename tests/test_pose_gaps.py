@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.enerf_trainer import recording_table
+from enerf_ns.tables import recording_table
 
 CUT = 900_000_000, 1_900_000_000
 

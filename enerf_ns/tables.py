@@ -1,0 +1,66 @@
+"""What training prints at its start: what the recording holds, and what is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from enerf_ns.choices import Choice
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.problems import find_problems
+from enerf_ns.dataparsers.scene_box import scene_normalisation
+
+if TYPE_CHECKING:
+    from enerf_ns.enerf_trainer import EnerfTrainerConfig
+
+
+def recording_table(config: EnerfTrainerConfig) -> Table:
+    """What the recording of a resolved config holds."""
+    recording = config.recording()
+    index, camera = index_events(recording), recording.camera
+    first, last = index.span
+    seconds = max(last - first, 1) * 1e-9
+    parser = config.pipeline.resolution.applied_to(config.pipeline).datamanager.dataparser
+    depth = parser.depth_range
+    rows = {
+        "folder": f"{recording.path} ({recording.format})",
+        "events": f"{len(index):,}, {100 * index.num_positive / len(index):.0f} % on",
+        "span": f"{seconds:.2f} s",
+        "rate": f"{len(index) / seconds / 1e6:.2f} million events/s, "
+        f"{len(index) / (camera.width * camera.height):.1f} a pixel",
+        "sensor": f"{camera.width} x {camera.height}, {camera.model}",
+        "poses": f"{len(recording.trajectory.times):,}",
+    }
+    for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
+        if frames is None:
+            rows[name] = "none"
+            continue
+        depth_note = ", with depth" if frames.depth_filenames else ""
+        rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
+    if depth is not None:
+        _, scale, box = scene_normalisation(recording, *depth, parser.box)
+        rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
+        rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
+    table = Table(title="Recording", show_header=False, title_justify="left")
+    for name, value in rows.items():
+        table.add_row(name, value)
+    for note in (*recording.notes, *index.notes):
+        table.add_row("note", f"[yellow]{note}[/yellow]")
+    for problem in find_problems(recording, depth):
+        table.add_row("[red]problem[/red]", f"[red]{problem.what}[/red] {problem.advice}")
+    return table
+
+
+def choices_table(choices: Sequence[Choice]) -> Table:
+    """What is kept and what is left out, why, and by which flag it is forced."""
+    prefix = "--pipeline."
+    table = Table(title="Parts of the method", caption=f"forced by {prefix}FLAG VALUE, those of event-data at the end")
+    table.title_justify = table.caption_justify = "left"
+    for column in ("part", "", "what", "why", "flag"):
+        table.add_column(column)
+    for choice in choices:
+        kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
+        table.add_row(choice.part, kept, choice.value, choice.why, f"[dim]{choice.flag.removeprefix(prefix)}[/dim]")
+    return table
