@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -44,9 +44,9 @@ def method_config(
         method_name=name,
         max_num_iterations=iterations,
         steps_per_save=1000,
-        steps_per_eval_batch=iterations + 1,
-        steps_per_eval_image=max(iterations // 10, 1),
-        steps_per_eval_all_images=iterations + 1,
+        steps_per_eval_batch=0,  # never: runs record their error themselves
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,
         mixed_precision=False,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=pipeline,
@@ -61,6 +61,7 @@ def method_config(
             },
         },
         viewer=ViewerConfig(quit_on_train_completion=True),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),
         vis="viewer",
     )
 

@@ -139,7 +139,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         config = self.config
         assert config.pair_mode is not None
         first, last = self.recording.span
-        around = np.concatenate([[first], (self.held_out_spans + [-1, 1]).flatten(), [last]]).reshape(-1, 2)
+        around = np.concatenate([[first], (self.held_out_spans + np.array([-1, 1])).flatten(), [last]]).reshape(-1, 2)
         try:
             return EventPairSampler(
                 self.index,

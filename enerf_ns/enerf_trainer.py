@@ -10,14 +10,16 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
 import yaml
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer import Viewer
 from torch import Tensor
 
 from enerf_ns.checkpoints import (
@@ -35,6 +37,7 @@ from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
+from enerf_ns.error_against_time import ErrorAgainstTime
 from enerf_ns.guarded_steps import (
     LEARNING_CHECKED_EVERY,
     LEARNING_CHECKED_FROM,
@@ -47,6 +50,7 @@ from enerf_ns.guarded_steps import (
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
 from enerf_ns.tables import choices_table, recording_table
+from enerf_ns.terminal import clear_line, say
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
@@ -62,6 +66,11 @@ class EnerfTrainerConfig(TrainerConfig):
     """The selections of the E-NeRF paper for one of its sequences; flags that are set stand. One of eds00, eds11,
     mocap-1d-trans, mocap-desk2, mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse,
     spiral1-more-sparse, spiral2."""
+
+    evaluation_share: float = 0.03
+    """Share of the training time that may go into evaluation meanwhile: scores of a few held-out frames and of held-out
+    events at moments evenly spaced in log time (history.jsonl), and previews. All held-out frames are scored once more
+    at the end, on top of that. 0: nothing is evaluated, at the end neither."""
 
     def resolved(self) -> EnerfTrainerConfig:
         """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
@@ -199,9 +208,25 @@ class EnerfTrainer(Trainer):
         self._skipped_in_a_row = 0
         self._trained = -1  # the last step that was
         self._interrupted = False
+        self._recorded: dict[str, Any] | None = None  # of the time before the checkpoint
         self._unsaved = ""  # why the last checkpoint could not be stored
         self._found_wrong: set[str] = set()
         self._handlers: dict[int, Any] = {}
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        super().setup(test_mode)
+        config = self.config
+        self.error_against_time = ErrorAgainstTime(
+            self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
+        )
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
+        if isinstance(self.viewer_state, Viewer):
+            CONSOLE.print(*self.viewer_state.viewer_info, sep="\n", soft_wrap=True, highlight=False, style="green")
+        elif self.viewer_state is not None:
+            CONSOLE.print(f"Legacy viewer at: {self.viewer_state.viewer_url}", soft_wrap=True, style="green")
+
+    def _check_viewer_warnings(self) -> None:
+        """Nothing: evaluation runs under every `--vis`."""
 
     def setup_optimizers(self) -> GuardedOptimizers:
         return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
@@ -215,6 +240,7 @@ class EnerfTrainer(Trainer):
             set_random_state(state["generators"], self.pipeline.device)
             self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
         vars(self.pipeline.model.sampler).update(state.get("sampler", {}))
+        self._recorded = state.get("error_against_time")
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -236,13 +262,14 @@ class EnerfTrainer(Trainer):
             "sampler": {
                 name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
             },
+            "error_against_time": self.error_against_time.state(),
         }
         path = checkpoint_path(self.checkpoint_dir, step)
         try:
             write_checkpoint(path, state)
         except OSError as error:
             self._unsaved = f"Step {step} could not be stored in {self.checkpoint_dir} ({error.strerror or error})"
-            _say(f"{self._unsaved}; the checkpoints before it stay. Make room.")
+            say(f"{self._unsaved}; the checkpoints before it stay. Make room.")
             return
         self._unsaved = ""
         if self.config.save_only_latest_checkpoint and not self._skipped_in_a_row:
@@ -260,11 +287,12 @@ class EnerfTrainer(Trainer):
         config, total = self.config, self.config.max_num_iterations
         self._trained = self._start_step - 1
         if self._start_step >= total:
-            _say(f"The run in {self.base_dir} is at its end, at step {total} of {total}.")
+            say(f"The run in {self.base_dir} is at its end, at step {total} of {total}.")
             return
         self._handle_signals()
         config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
         try:
+            self.error_against_time.begin(self._start_step, self._recorded)
             super().train()
         except OSError as error:  # of what Nerfstudio writes beside checkpoints, such as TensorBoard's files
             raise SystemExit(
@@ -277,7 +305,9 @@ class EnerfTrainer(Trainer):
             self._restore_signals()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        results = super().train_iteration(step)
+        with self.error_against_time.step(step):
+            results = super().train_iteration(step)
+        self._metrics = results[2]
         self._trained = step
         if self.optimizers.skipped:
             self._look_at_skipped(step)
@@ -289,11 +319,23 @@ class EnerfTrainer(Trainer):
             self.stop_training = True
         return results
 
+    def eval_iteration(self, step: int) -> None:
+        super().eval_iteration(step)
+        if not self.stop_training:
+            self.error_against_time.after_step(step, self._metrics)
+
+    def _finish(self, step: int) -> None:
+        """Scores the run at its end, whose checkpoint is stored by then."""
+        with self.train_lock:
+            self.error_against_time.finish()
+        writer.write_out_storage()
+
     def _is_finite(self) -> bool:
         """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
 
         Where mixed precision scales the loss, gradients that overflow are the scaler's, who leaves them out.
         """
+        self.pipeline.stopwatch.lap("backward")
         numbers = list(self.pipeline.last_step.losses.values())
         if self.grad_scaler.get_scale() <= 1:
             numbers += [
@@ -316,7 +358,7 @@ class EnerfTrainer(Trainer):
                 keep_batch(seen, step, file)
             except OSError as error:
                 file = f"not kept ({error.strerror})"
-            _say(f"Step {step} is left out, since {term} is not finite; its batch is {file}.")
+            say(f"Step {step} is left out, since {term} is not finite; its batch is {file}.")
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
                 f"enerf: Training stopped at step {step}, since {term} is not finite, {MOST_SKIPPED} steps in a row; "
@@ -329,7 +371,7 @@ class EnerfTrainer(Trainer):
         found = why_nothing_is_learnt(self.pipeline.last_step, self.pipeline.model.sensor)
         for reason in found.keys() - self._found_wrong:
             self._found_wrong.add(reason)
-            _say(
+            say(
                 f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
                 "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and "
                 "clock with `enerf inspect`."
@@ -352,7 +394,7 @@ class EnerfTrainer(Trainer):
         if self._interrupted:
             raise SystemExit(130)
         self._interrupted = self.stop_training = True
-        _say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
+        say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
 
     def _train_complete_viewer(self) -> None:
         self._restore_signals()  # the viewer runs until it is interrupted
@@ -365,6 +407,7 @@ class EnerfTrainer(Trainer):
             if self._trained >= self._start_step:
                 self.save_checkpoint(self._trained)
             writer.write_out_storage()
+            clear_line()
             self._say_skipped()
             CONSOLE.print(
                 f"[bold]continue:[/bold] ns-train {self.config.method_name} --load-config {config}",
@@ -388,8 +431,4 @@ class EnerfTrainer(Trainer):
 
     def _say_skipped(self) -> None:
         if self.num_skipped:
-            _say(f"{self.num_skipped} steps were left out, since they were not finite.")
-
-
-def _say(sentence: str) -> None:
-    CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
+            say(f"{self.num_skipped} steps were left out, since they were not finite.")

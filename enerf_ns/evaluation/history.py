@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.files import write_together, write_whole
 
 HISTORY_FILE = "history.jsonl"
 """Name of the file in a run's folder, one `HistoryRow` a line."""
@@ -34,13 +34,12 @@ class HistoryRow:
 
 
 def append_row(folder: Path, row: HistoryRow) -> None:
-    """Adds a row to the history of the run in a folder.
+    """Adds a row to the history of the run in a folder, whole or not at all.
 
     Raises:
         OSError: It cannot be written.
     """
-    with (folder / HISTORY_FILE).open("a") as file:
-        file.write(json.dumps(asdict(row)) + "\n")
+    write_together(folder, {}, {HISTORY_FILE: json.dumps(asdict(row)) + "\n"})
 
 
 def read_history(folder: Path) -> list[HistoryRow]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import track
@@ -20,7 +21,7 @@ from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_datamanager import EnerfDataManager
 from enerf_ns.enerf_model import EnerfModel
-from enerf_ns.evaluation.metrics import Score, align_brightness, align_channels, fit_fault
+from enerf_ns.evaluation.metrics import Score, align_brightness, align_channels, fit_fault, is_known
 
 
 class RenderingPipeline(Protocol):
@@ -62,14 +63,54 @@ class HeldOutView:
 
 
 @torch.no_grad()
+def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> HeldOutView:
+    """Render one held-out frame, its brightness as it is.
+
+    Args:
+        pipeline: With a trained field, as in evaluation.
+        number: Of the held-out frame, from 0.
+        reduced_by: Pixels along the squares that one pixel of the view stands for: the frame is their mean, its depth
+            is unknown where that of any of them is, and rays go through their middles.
+    """
+    manager = pipeline.datamanager
+    dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
+    data = dataset[number]
+    camera = dataset.cameras[number : number + 1].to(pipeline.device)
+    if reduced_by > 1:
+        size = camera.height // reduced_by, camera.width // reduced_by
+        camera.rescale_output_resolution(1.0 / reduced_by)
+        camera.height, camera.width = size
+    rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+    outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+    z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
+    depth = data.get("depth")
+    if depth is not None and reduced_by > 1:
+        depth = _reduced(depth, reduced_by) * (_reduced(is_known(depth).float(), reduced_by) == 1.0)
+    return HeldOutView(
+        recorded=_reduced(data["image"][..., :3], reduced_by) if dataset.are_frames else None,
+        rendered=outputs["rgb"].cpu(),
+        unaligned=outputs["rgb"].cpu(),
+        depth=z_depth.cpu(),
+        recorded_depth=depth,
+        time=int(dataset.frames.times[number]),
+    )
+
+
+def _reduced(picture: Tensor, by: int) -> Tensor:
+    """Means over squares of pixels of a picture (height, width, channels); rows and columns left over are cut off."""
+    return torch.nn.functional.avg_pool2d(picture.movedim(-1, 0), by).movedim(0, -1) if by > 1 else picture
+
+
+@torch.no_grad()
 def held_out_views(
-    pipeline: RenderingPipeline, numbers: Sequence[int] | None = None
+    pipeline: RenderingPipeline, numbers: Sequence[int] | None = None, reduced_by: int = 1
 ) -> tuple[list[HeldOutView], dict[str, Score]]:
     """Render held-out frames; align brightness over all of them where the field learnt from events alone.
 
     Args:
         pipeline: With a trained field.
-        numbers: Of the held-out frames, from 0. None: all.
+        numbers: Of the held-out frames, from 0. None: all, with a bar that shows how far it is.
+        reduced_by: As of `held_out_view`.
 
     Returns:
         The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
@@ -78,26 +119,11 @@ def held_out_views(
     """
     pipeline.eval()
     manager = pipeline.datamanager
-    dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
-    views: list[HeldOutView] = []
+    dataset = manager.eval_dataset
     start = time.perf_counter()
     chosen = range(len(dataset)) if numbers is None else numbers
-    for index in track(chosen, "Rendering held-out frames", console=CONSOLE, transient=True):
-        data = dataset[index]
-        camera = dataset.cameras[index : index + 1].to(pipeline.device)
-        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
-        outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
-        z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
-        views.append(
-            HeldOutView(
-                recorded=data["image"][..., :3] if dataset.are_frames else None,
-                rendered=outputs["rgb"].cpu(),
-                unaligned=outputs["rgb"].cpu(),
-                depth=z_depth.cpu(),
-                recorded_depth=data.get("depth"),
-                time=int(dataset.frames.times[index]),
-            )
-        )
+    shown = track(chosen, "Rendering held-out frames", console=CONSOLE, transient=True, disable=numbers is not None)
+    views = [held_out_view(pipeline, number, reduced_by) for number in shown]
     seconds = time.perf_counter() - start
     summary: dict[str, Score] = {
         "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
@@ -147,12 +173,17 @@ def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
     """
     for index, view in enumerate(views):
         shown = [view.rendered] if view.recorded is None else [view.recorded, view.rendered]
-        picture = torch.cat(shown, dim=1).nan_to_num().clamp(0.0, 1.0)
-        content = io.BytesIO()
-        Image.fromarray((255.0 * picture.numpy()).round().astype(np.uint8)).save(content, format="png")
         try:
-            write_whole(folder / f"eval_img_{index:04d}.png", content.getvalue())
+            write_whole(folder / f"eval_img_{index:04d}.png", png(torch.cat(shown, dim=1)))
         except OSError as error:
             raise OutputError(
                 f"The folder of pictures {folder} could not be written to ({error.strerror}); give another one."
             ) from error
+
+
+def png(picture: Float[Tensor, "height width 3"]) -> bytes:
+    """A picture in [0, 1] as a PNG file; what is not finite is black or white."""
+    content = io.BytesIO()
+    pixels = (255.0 * picture.nan_to_num().clamp(0.0, 1.0).cpu().numpy()).round().astype(np.uint8)
+    Image.fromarray(pixels).save(content, format="png")
+    return content.getvalue()

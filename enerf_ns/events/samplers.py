@@ -127,8 +127,8 @@ class EventPairSampler:
 class HeldOutPairSampler:
     """Draws pairs of events of one pixel that both lie within spans of time, whose events are kept from training.
 
-    All pairs of at most `max_distance` events of the pixel are equally likely; as of `EventPairSampler`, no pair has zero
-    length. Events between two spans count, where they are so few.
+    All pairs that are at most `max_distance` events of the pixel apart are equally likely; as of `EventPairSampler`, no
+    pair has zero length. The two may lie in different spans; events between these count.
 
     Args:
         index: The events; batches come out on its device.

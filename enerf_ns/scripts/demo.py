@@ -28,7 +28,6 @@ class Demo:
         output_dir = self.output_dir.expanduser().resolve()
         recording = output_dir / "recording"
         config = method_config("enerf", recording, output_dir / "runs")
-        config.steps_per_eval_image = config.steps_per_eval_batch
         if self.max_num_iterations is not None:
             config.max_num_iterations = self.max_num_iterations
         check_ranges(config)

@@ -1,0 +1,55 @@
+"""What training says on the terminal, or in what stands for one."""
+
+from __future__ import annotations
+
+import shutil
+import time
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.control import Control
+from rich.segment import ControlType
+
+REWRITTEN_EVERY, PRINTED_EVERY = 0.25, 30.0
+"""Seconds between two states of the line on a terminal, and where lines cannot be rewritten."""
+
+
+class StatusLine:
+    """One line that is rewritten in place; where the output is no terminal, it is printed now and then."""
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the line is to be shown anew."""
+        return time.monotonic() >= self._next
+
+    def show(self, text: str) -> None:
+        """Shows the line; what is printed next takes its place on a terminal."""
+        clear_line()
+        if CONSOLE.is_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            CONSOLE.print(text[:width], end="\r", soft_wrap=True, markup=False, highlight=False)
+        else:
+            CONSOLE.print(text, soft_wrap=True, markup=False, highlight=False)
+        self._next = time.monotonic() + (REWRITTEN_EVERY if CONSOLE.is_terminal else PRINTED_EVERY)
+
+
+def clear_line() -> None:
+    """Removes what the line shows, before anything else is printed."""
+    CONSOLE.control(Control((ControlType.ERASE_IN_LINE, 2)))
+
+
+def say(sentence: str) -> None:
+    """Prints what a person should know, in yellow."""
+    clear_line()
+    CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
+
+
+def duration(seconds: float) -> str:
+    """A time as a person says it, in its two largest units."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
