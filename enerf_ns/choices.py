@@ -457,7 +457,7 @@ class _Resolver:
         levels = self.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
         growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
         why = f"as fine as the sensor's pixels, each {growth:.2f} times as fine as the one before"
-        why = "set by flag" if model.max_res is not None else self.why(name, why)
+        why = self.why("model.max_res" if model.max_res is not None else name, why)
         self.row("hash grid", True, f"{levels} levels, {model.base_res} to {resolution} cells", why, name)
 
     def _rays(self) -> None:
