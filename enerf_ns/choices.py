@@ -46,9 +46,16 @@ class MethodDefaults:
     no_event_margin: float = 0.0
     paper_batch: bool = False
     """Whether presets bring their batch sizes, which are for a GPU."""
+    settings: tuple[tuple[str, Any], ...] = ()
+    """What the method sets, which presets and recordings leave alone: names within the config of the pipeline, such as
+    model.sampling, and values."""
 
 
 DEFAULT_SILENCE_MS = 20.0
+DEFAULT_WINDOW_MS = 60.0
+
+LONGEST_ACCUMULATION = 0.05
+"""Longest window of accumulated events, as a share of the recording's time: EventNeRF's 50 of 1000 views."""
 
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""
@@ -190,8 +197,9 @@ class _Resolver:
 
     def why(self, name: str, otherwise: str) -> str:
         """Who decided a setting."""
-        if attrgetter(name)(self.config) is not None:
-            return "set by flag"
+        value = attrgetter(name)(self.config)
+        if value is not None:
+            return "set by the method" if (name, value) in self.config.defaults.settings else "set by flag"
         return "the preset states it" if name in self.preset_values else otherwise
 
     def row(self, part: str, kept: bool, value: str, why: str, name: str) -> None:
@@ -275,13 +283,16 @@ class _Resolver:
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
+        longest = LONGEST_ACCUMULATION * 1e-6 * (recording.span[1] - recording.span[0])
+        window = self.use("datamanager.window_ms", lambda: longest if mode == "accumulated" else DEFAULT_WINDOW_MS)
         if not self.use_events:
             self.row("event loss", False, "", f"supervision is {data.supervision}", "datamanager.supervision")
             return
         values = {
             "successor": "each event with the pixel's next",
             "partner": f"each event with one of the pixel's next {data.max_pair_distance}",
-            "window": f"each event with the pixel's last in {data.window_ms:g} ms",
+            "window": f"each event with the pixel's last in {window:g} ms",
+            "accumulated": f"the sum of a pixel's events over up to {window:g} ms",
         }
         why = "learns from events"
         if blind and mode != "successor":
@@ -304,9 +315,14 @@ class _Resolver:
             self.row("silent pixels", False, "", "no events are used", "datamanager.supervision")
             return
         share = silent_share(index_events(self.recording), round(silence * 1e6))
-        silent_pairs = self.use(name, lambda: defaults.silent_pairs if share > SMALLEST_SILENT_SHARE else 0)
+        between = self.config.datamanager.silent_mode == "intervals"
+        found = between or share > SMALLEST_SILENT_SHARE
+        silent_pairs = self.use(name, lambda: defaults.silent_pairs if found else 0)
         value = f"{silent_pairs} pairs a step" if silent_pairs else "they are not searched"
         why = f"pixels are silent for {silence:g} ms and longer during {100 * share:.1f} % of the time"
+        if between:
+            value += ", between successive events" if silent_pairs else ""
+            why = "all pixels are silent between their events"
         if not defaults.silent_pairs:
             why = "the method does without"
         self.row("silent pixels", bool(silent_pairs), value, self.why(name, why), name)
@@ -445,7 +461,7 @@ class _Resolver:
         levels = self.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
         growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
         why = f"as fine as the sensor's pixels, each {growth:.2f} times as fine as the one before"
-        why = "set by flag" if model.max_res is not None else self.why(name, why)
+        why = self.why("model.max_res" if model.max_res is not None else name, why)
         self.row("hash grid", True, f"{levels} levels, {model.base_res} to {resolution} cells", why, name)
 
     def _rays(self) -> None:

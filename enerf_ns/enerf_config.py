@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from operator import attrgetter
+from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
@@ -16,6 +18,7 @@ from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.published_losses import PUBLISHED_LOSSES
 
 
 @dataclass
@@ -40,6 +43,7 @@ def method_config(
     name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
 ) -> EnerfTrainerConfig:
     """A trainer whose learning rate falls to a tenth over the run, on the device that the machine has."""
+    pipeline.defaults = replace(pipeline.defaults, settings=_settings(pipeline))
     return EnerfTrainerConfig(
         method_name=name,
         max_num_iterations=iterations,
@@ -66,20 +70,47 @@ def method_config(
     )
 
 
+def _settings(pipeline: EnerfPipelineConfig) -> tuple[tuple[str, Any], ...]:
+    """What a pipeline's config holds that is not the default of its class, as `MethodDefaults.settings` has it."""
+    found = []
+    for section in ("datamanager", "model", "model.sensor"):
+        part = attrgetter(section)(pipeline)
+        default = type(part)()
+        values = {field.name: getattr(part, field.name) for field in fields(part)}
+        found += [
+            (f"{section}.{name}", value)
+            for name, value in values.items()
+            if not is_dataclass(value) and value != getattr(default, name)
+        ]
+    return tuple(found)
+
+
 RAYS_PER_CHUNK = 1 << (15 if torch.cuda.is_available() else 12)
 """Rays rendered at once: enough to keep the device busy, few enough for the cache of a CPU."""
 
+
+def _enerf(name: str, settings: Mapping[str, Any]) -> EnerfTrainerConfig:
+    """The method enerf under a name, with other settings, by the names of ns-train's flags."""
+    model = EnerfModelConfig(eval_num_rays_per_chunk=RAYS_PER_CHUNK)
+    pipeline = EnerfPipelineConfig(datamanager=EnerfDataManagerConfig(), model=model)
+    for path, value in settings.items():
+        section, _, setting = path.removeprefix("pipeline.").rpartition(".")
+        setattr(attrgetter(section)(pipeline), setting, value)
+    return method_config(name, iterations=4000, learning_rate=1e-2, pipeline=pipeline)
+
+
+def _with_losses(name: str) -> MethodSpecification:
+    losses = PUBLISHED_LOSSES[name]
+    return MethodSpecification(_enerf(name, losses.settings), f"Losses of {losses.source} on the field of enerf.")
+
+
 enerf = MethodSpecification(
-    config=method_config(
-        "enerf",
-        iterations=4000,
-        learning_rate=1e-2,
-        pipeline=EnerfPipelineConfig(
-            datamanager=EnerfDataManagerConfig(), model=EnerfModelConfig(eval_num_rays_per_chunk=RAYS_PER_CHUNK)
-        ),
-    ),
-    description="E-NeRF: radiance field from an event camera, tuned for error against time.",
+    _enerf("enerf", {}), "E-NeRF: radiance field from an event camera, tuned for error against time."
 )
+enerf_paper_loss = _with_losses("enerf-paper-loss")
+enerf_eventnerf = _with_losses("enerf-eventnerf")
+enerf_robust = _with_losses("enerf-robust")
+enerf_deblur = _with_losses("enerf-deblur")
 
 PAPER = MethodDefaults(
     event_pairs=30096,

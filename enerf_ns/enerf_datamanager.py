@@ -26,7 +26,13 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Frames, overlaps
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
-from enerf_ns.events.samplers import EventPairSampler, HeldOutPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import (
+    AccumulationSampler,
+    EventPairSampler,
+    HeldOutPairSampler,
+    SilentIntervalSampler,
+    SilentPixelSampler,
+)
 from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.ray_samplers import PairedRayBundle
 from enerf_ns.sensor.sensor_model import SensorModel
@@ -59,18 +65,23 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """What the field learns from."""
     event_pairs: Optional[int] = None  # noqa: UP045
     """Pairs of instants with events between them, drawn at each step. None: 1024, or as the paper for enerf-paper."""
-    pair_mode: Optional[Literal["successor", "partner", "window"]] = None  # noqa: UP045
-    """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. None: one of the
-    next few, but the next where the sensor has a refractory period, in which changes go unseen."""
+    pair_mode: Optional[Literal["successor", "partner", "window", "accumulated"]] = None  # noqa: UP045
+    """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. Or no two events,
+    but a window of any length whose events are summed, as in EventNeRF (accumulated). None: one of the next few, but
+    the next where the sensor has a refractory period, in which changes go unseen."""
     max_pair_distance: int = 10
     """Events of the pixel that a partner may lie ahead, for pair-mode partner."""
-    window_ms: float = 60.0
-    """Length of the windows for pair-mode window."""
+    window_ms: Optional[float] = None  # noqa: UP045
+    """Length of the windows for pair-mode window, and of the longest for accumulated. None: 60; for accumulated a
+    twentieth of the recording."""
     uniform_over: Literal["pairs", "pixels"] = "pairs"
     """Draw every pair alike, or every active pixel alike."""
     silent_pairs: Optional[int] = None  # noqa: UP045
     """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, or as the
     paper for enerf-paper. 0: silent pixels are not searched."""
+    silent_mode: Literal["pixels", "intervals"] = "pixels"
+    """Where silent pairs lie: at any pixel while it is silent for silence-ms, or between any two successive events of a
+    pixel, as in the total variation of Deblur e-NeRF."""
     silence_ms: Optional[float] = None  # noqa: UP045
     """Shortest silence of a pixel that counts. None: 20, or as the preset."""
     held_out_events: float = 0.02
@@ -130,24 +141,25 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return index_events(self.recording).to(self.device)
 
     @cached_property
-    def pair_sampler(self) -> EventPairSampler:
+    def pair_sampler(self) -> EventPairSampler | AccumulationSampler:
         """Draws event pairs as the config says.
 
         Raises:
             FlagError: There is none to draw.
         """
         config = self.config
-        assert config.pair_mode is not None
-        first, last = self.recording.span
-        around = np.concatenate([[first], (self.held_out_spans + np.array([-1, 1])).flatten(), [last]]).reshape(-1, 2)
+        assert config.pair_mode is not None and config.window_ms is not None
+        window_ns = round(config.window_ms * 1e6)
         try:
+            if config.pair_mode == "accumulated":
+                return AccumulationSampler(self.index, *self._span, window_ns, self._stretches)
             return EventPairSampler(
                 self.index,
                 config.pair_mode,
                 max_distance=config.max_pair_distance,
-                window_ns=round(config.window_ms * 1e6),
+                window_ns=window_ns,
                 uniform_over=config.uniform_over,
-                stretches=self._parts(overlaps(self.recording.stretches, around)),
+                stretches=self._stretches,
             )
         except ValueError as error:
             raise FlagError(f"{self.recording.path}: {error}") from error
@@ -163,21 +175,17 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             return str(error)
 
     @cached_property
-    def silent_sampler(self) -> SilentPixelSampler | None:
+    def silent_sampler(self) -> SilentPixelSampler | SilentIntervalSampler | None:
         """Draws silent pixels as the config says; None where it wants none."""
         if not self.config.silent_pairs:
             return None
+        if self.config.silent_mode == "intervals":
+            return SilentIntervalSampler(self.index, self._stretches)
         assert self.config.silence_ms is not None
         silence = round(self.config.silence_ms * 1e6)
-        span = index_events(self.recording).span
-        return SilentPixelSampler(
-            self.index,
-            *span,
-            silence,
-            silence,
-            self._parts(self.recording.stretches),
-            torch.from_numpy(self.held_out_spans).to(self.device),
-        )
+        held_out = torch.from_numpy(self.held_out_spans).to(self.device) if len(self.held_out_spans) else None
+        stretches = self._parts(self.recording.stretches)
+        return SilentPixelSampler(self.index, *self._span, silence, silence, stretches, held_out)
 
     @cached_property
     def event_camera(self) -> PosedCamera:
@@ -241,7 +249,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def event_rays(self, batch: EventBatch, sensor: SensorModel) -> RayBundle:
         """Rays of all first instants, from when the pixels can see, then of all second ones."""
-        delays = sensor.blind_after(batch.start, batch.end)
+        at_events = self.config.pair_mode != "accumulated"
+        delays = sensor.blind_after(batch.start, batch.end) if at_events else None
         if delays is not None:
             delays[batch.silent] = 0.0
             delays = torch.cat([delays, torch.zeros_like(delays)])
@@ -266,6 +275,18 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def _parts(self, stretches: Int64[np.ndarray, "stretches 2"]) -> Tensor | None:
         """First and last instant (ns) of parts of the recording, for samplers; None where they are its span."""
         return None if stretches.tolist() == [[*self.recording.span]] else torch.from_numpy(stretches).to(self.device)
+
+    @property
+    def _span(self) -> tuple[int, int]:
+        """Times of the first and of the last event that is used, ns."""
+        return index_events(self.recording).span
+
+    @property
+    def _stretches(self) -> Tensor | None:
+        """First and last instant (ns) of each part of time that is learnt from; None where that is the whole span."""
+        first, last = self.recording.span
+        around = np.concatenate([[first], (self.held_out_spans + np.array([-1, 1])).flatten(), [last]]).reshape(-1, 2)
+        return self._parts(overlaps(self.recording.stretches, around))
 
     @property
     def _frames(self) -> Frames:

@@ -146,6 +146,31 @@ def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_pa
     assert rows(resolution)["response"].why == "the recording states it"
 
 
+def test_what_a_method_sets_is_said_to_be_set_by_it(recording: Path):
+    """Until a flag says otherwise; of enerf nothing is."""
+    parts = ("high dynamic range", "hash grid", "proposal network", "opacity loss", "contraction", "view direction")
+    said = rows(resolve(PAPER, read_recording(recording)))
+    assert {said[part].why for part in parts} == {"set by the method"}
+    config = copy.deepcopy(PAPER)
+    config.model.sampling, config.model.opacity_loss_weight = "proposal", 0.5
+    said = rows(resolve(config, read_recording(recording)))
+    assert said["proposal network"].why == said["opacity loss"].why == "set by flag"
+    assert said["contraction"].why == "set by the method"
+    assert not any("set by" in row.why for row in rows(resolve(ENERF, read_recording(recording))).values())
+
+
+@pytest.mark.parametrize(
+    ("mode", "window_ms", "expected"),
+    [("accumulated", None, 5.0), ("accumulated", 7.0, 7.0), ("window", None, 60.0), ("window", 8.0, 8.0)],
+)  # a tenth of a second is recorded
+def test_windows_are_as_long_as_is_said(recording: Path, mode: str, window_ms: float | None, expected: float):
+    config = copy.deepcopy(ENERF)
+    config.datamanager.pair_mode, config.datamanager.window_ms = mode, window_ms
+    resolution = resolve(config, read_recording(recording))
+    assert resolution.applied_to(config).datamanager.window_ms == pytest.approx(expected)
+    assert f"{expected:g} ms" in rows(resolution)["event loss"].value
+
+
 @pytest.mark.parametrize(
     ("setting", "value", "part"),
     [

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from enerf_ns.published_losses import PUBLISHED_LOSSES
+
 ROOT = Path(__file__).parents[1]
 SPECIFICATIONS = {
     "nerfstudio.method_configs": "MethodSpecification",
@@ -66,7 +68,7 @@ def test_module_of_the_plugin_can_be_imported_first(module):
 def test_entry_points_are_specifications():
     assert {point.name for point in ENTRY_POINTS} >= {
         "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
-        "tumvie-events", "event-recording",
+        "tumvie-events", "event-recording", *PUBLISHED_LOSSES,
     }  # fmt: skip
     for point in ENTRY_POINTS:
         assert type(point.load()).__name__ == SPECIFICATIONS[point.group]

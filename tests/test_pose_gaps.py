@@ -61,9 +61,11 @@ def config_of(folder: Path, output_dir: Path, keep: bool = False, **changes: Any
 
 
 @pytest.mark.parametrize("keep", [False, True])
-@pytest.mark.parametrize("mode", ["successor", "partner", "window"])
-def test_nothing_is_drawn_from_a_gap_unless_it_is_kept(folder: Path, gap, tmp_path: Path, mode: str, keep: bool):
+@pytest.mark.parametrize("silent", ["pixels", "intervals"])
+@pytest.mark.parametrize("mode", ["successor", "partner", "window", "accumulated"])
+def test_nothing_is_drawn_from_a_gap_unless_it_is_kept(folder: Path, gap, tmp_path, mode: str, silent: str, keep: bool):
     changes = dict(data__pair_mode=mode, data__window_ms=500.0, data__event_pairs=3000, data__silent_pairs=3000)
+    changes["data__silent_mode"] = silent
     pipeline = set_up(config_of(folder, tmp_path, keep, **changes)).pipeline
     events = pipeline.datamanager.next_batch(pipeline.model.sensor).events
     for kind in (events.silent, events.fired):

@@ -15,15 +15,16 @@ from typing import Any
 
 import pytest
 import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from small_runs import set_up, small_config
 
 from enerf_ns.dataparsers.errors import FlagError
-from enerf_ns.enerf_config import enerf, enerf_paper
+from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.published_losses import PUBLISHED_LOSSES
 from enerf_ns.ranges import RANGES, check_ranges
 
-METHODS = {"enerf": enerf.config, "enerf-paper": enerf_paper.config}
+METHODS = {name: all_methods[name] for name in ("enerf", "enerf-paper", *PUBLISHED_LOSSES)}
 
 SOUND: dict[str, Any] = {
     "depth_range": (1.0, 2.0),

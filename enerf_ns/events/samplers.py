@@ -198,27 +198,15 @@ class SilentPixelSampler:
                 f"not {min_duration_ns} and {max_duration_ns}."
             )
         self.index = index
-        self.start_ns, self.end_ns = start_ns, end_ns
         self.min_duration_ns, self.max_duration_ns = min_duration_ns, max_duration_ns
-        usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
-        usable[index.hot_pixels] = False
-        self._pixels = usable.nonzero()[:, 0]
-        self._stretches = None
-        if stretches is not None:
-            begins, ends = stretches.clamp(start_ns, end_ns).T
-            used = (stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)
-            if not used.any():
-                raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
-            begins, ends = begins[used], ends[used]
-            after = (ends - begins + 1).cumsum(0)
-            self._stretches = begins, ends, after, int(after[-1])
-        self._held_out = index.offsets.new_zeros((0, 2)) if held_out is None else held_out
+        self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
+        self._held_out = held_out
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
 
         Where silent intervals are so rare that `ROUNDS` rounds find fewer, those found are used again, with other
-        instants; where they find none, the batch is empty.
+        instants; where they find none, the batch is empty. It has fewer pairs where most of time is held out.
 
         Args:
             batch_size: Pairs.
@@ -232,23 +220,19 @@ class SilentPixelSampler:
                 break
         pixels, begin, end = (torch.cat(parts) for parts in zip(*found, strict=True))
         if len(pixels):
-            again = torch.arange(batch_size, device=pixels.device) % len(pixels)
+            drawn = batch_size if self._held_out is None else 2 * batch_size
+            again = torch.arange(drawn, device=pixels.device) % len(pixels)
             pixels, begin, end = pixels[again], begin[again], end[again]
-        first = begin - self._held_out_before(begin)
-        instants = self._not_held_out(begin, end)
-        one = _randint(instants, generator)
-        other = _randint(instants - 1, generator)
-        other += other >= one
-        start, end = (self._instant(first + place) for place in (torch.minimum(one, other), torch.maximum(one, other)))
-        none = torch.zeros_like(pixels)
-        return EventBatch(pixels, start, end, none, none, num_silent=len(pixels))
+        batch = _silent_pairs(pixels, begin, end, generator)
+        if self._held_out is None:
+            return batch
+        learnt = (_part(torch.stack([batch.start, batch.end]), self._held_out) % 2 == 0).all(dim=0)
+        return batch.subset(learnt & (learnt.cumsum(0) <= batch_size))
 
     def _silent_intervals(self, draws: int, generator: torch.Generator, blind_ns: int) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""
         times, offsets = self.index.times, self.index.offsets
-        chosen = torch.randint(len(self._pixels), (draws,), generator=generator, device=times.device)
-        pixels = self._pixels[chosen]
-        instant, start_ns, end_ns = self._instants(draws, generator)
+        pixels, instant, start_ns, end_ns = self._moments.draw(draws, generator)
         first, stop = offsets[pixels], offsets[pixels + 1]
         following = first + self.index.count_until(pixels, instant)
         previous_time = times[(following - 1).clamp(min=0)]
@@ -258,35 +242,166 @@ class SilentPixelSampler:
         usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
         end = torch.minimum(end, instant + self.max_duration_ns // 2)
-        usable &= self._not_held_out(begin, end) >= 2
         return pixels[usable], begin[usable], end[usable]
 
-    def _held_out_before(self, times: Tensor) -> Tensor:
-        """How much of the time before each time is held out, ns."""
-        begins, ends = self._held_out.T
-        return (times[:, None] - begins).clamp(min=0).minimum(ends + 1 - begins).sum(dim=-1)
 
-    def _not_held_out(self, begin: Tensor, end: Tensor) -> Tensor:
-        """Number of instants from begin to end, both included, that are not held out."""
-        return end + 1 - self._held_out_before(end + 1) - (begin - self._held_out_before(begin))
+class SilentIntervalSampler:
+    """Draws two instants between two successive events of a pixel, for the total variation of Deblur e-NeRF (Low and
+    Lee, ECCV 2024).
 
-    def _instant(self, places: Tensor) -> Tensor:
-        """Instants that are not held out, of which as many lie before, from time 0 on, as the places say."""
-        begins = self._held_out[:, 0].contiguous()
-        passed = torch.searchsorted(begins - self._held_out_before(begins), places, right=True)
-        lengths = self._held_out.diff(dim=1)[:, 0] + 1
-        return places + torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])[passed]
+    All intervals between successive events are equally likely, however long. Within one, which begins when the pixel
+    can see again, two instants are drawn uniformly, never at an event.
 
-    def _instants(self, draws: int, generator: torch.Generator) -> tuple[Tensor, Tensor | int, Tensor | int]:
-        """Instants drawn at random, and the first and the last instant of the stretches that they lie in."""
+    Args:
+        index: The events; batches come out on its device.
+        stretches: As of `EventPairSampler`; no interval reaches over a gap.
+
+    Raises:
+        ValueError: There is no interval to draw.
+    """
+
+    def __init__(self, index: EventIndex, stretches: Int64[Tensor, "stretches 2"] | None = None):
+        self._intervals = EventPairSampler(index, "successor", stretches=stretches)
+        self._stretches = stretches
+
+    def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
+        """Draws `batch_size` silent pairs (on = off = 0), less those of intervals that hold no two instants.
+
+        Args:
+            batch_size: Pairs.
+            generator: On the device of the index.
+            refractory_ns: For how long a pixel is blind after an event.
+        """
+        intervals = self._intervals.sample(batch_size, generator)
+        begin, end = intervals.start + max(refractory_ns, 1), intervals.end - 1
+        usable = begin < end
+        if self._stretches is not None:
+            usable &= _part(intervals.start, self._stretches) == _part(intervals.end, self._stretches)
+        return _silent_pairs(intervals.pixels[usable], begin[usable], end[usable], generator)
+
+
+class AccumulationSampler:
+    """Draws pixels and windows of time, whose events are summed, as EventNeRF does (Rudnev et al., CVPR 2023).
+
+    A window ends at an instant drawn uniformly over the recording, or its stretches, and is as long as is drawn
+    uniformly up to `max_duration_ns`, less what lies before the recording or the stretch. A pixel is drawn uniformly
+    over the sensor, hot pixels left out. Of what is drawn so, the pairs are windows in which the pixel fired, and, so
+    that silence counts too, a share `NEGATIVE_SHARE` of any.
+
+    The change over a window is known only up to a threshold at either end, since neither is an event. Where pixels are
+    blind for a while after an event, what changes meanwhile is missing from the sum.
+
+    Args:
+        index: The events; batches come out on its device.
+        start_ns, end_ns: First and last instant that may be drawn.
+        max_duration_ns: At least 1.
+        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+
+    Raises:
+        ValueError: The duration is shorter than its minimum, or there is no event to draw.
+    """
+
+    NEGATIVE_SHARE = 0.1
+    ROUNDS = 32
+
+    def __init__(
+        self,
+        index: EventIndex,
+        start_ns: int,
+        end_ns: int,
+        max_duration_ns: int,
+        stretches: Int64[Tensor, "stretches 2"] | None = None,
+    ):
+        if max_duration_ns < 1:
+            raise ValueError(f"Windows need a max_duration_ns of at least 1, not {max_duration_ns}.")
+        if start_ns == end_ns or not _last_of_each(index, None, stretches).any():
+            where = " outside the gaps of the poses" if stretches is not None else ""
+            raise ValueError(f"No pixel fired events at two different times{where}, so there is nothing to train on.")
+        self.index = index
+        self.max_duration_ns = max_duration_ns
+        self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
+        """Draws `batch_size` pairs.
+
+        Where events are so rare that `ROUNDS` rounds find fewer pairs with events, those found are used again; where
+        they find none, there are negatives alone.
+
+        Args:
+            batch_size: Pairs.
+            generator: On the device of the index.
+        """
+        negatives, draws = round(self.NEGATIVE_SHARE * batch_size), max(2 * batch_size, 1024)
+        negative, windows = self._windows(draws, generator).tensor_split([negatives], dim=1)
+        found = [_with_events(windows)]
+        while sum(part.shape[1] for part in found) < batch_size - negatives and len(found) < self.ROUNDS:
+            found.append(_with_events(self._windows(draws, generator)))
+        fired = torch.cat(found, dim=1)
+        if fired.shape[1]:
+            fired = fired[:, torch.arange(batch_size - negatives, device=fired.device) % fired.shape[1]]
+        return EventBatch(*torch.cat([fired, negative], dim=1))
+
+    def _windows(self, draws: int, generator: torch.Generator) -> Int64[Tensor, "5 windows"]:
+        """Pixels, starts, ends, on and off events of windows of any length but 0 at any pixel; at most `draws`."""
+        pixels, end, first, _ = self._moments.draw(draws, generator)
+        duration = torch.randint(self.max_duration_ns, (draws,), generator=generator, device=end.device) + 1
+        start = (end - duration).clamp(min=first)
+        until_start, until_end = (self.index.count_until(pixels, time) for time in (start, end))
+        before = self.index.offsets[pixels]
+        on = self._positives(before + until_end) - self._positives(before + until_start)
+        off = until_end - until_start - on
+        return torch.stack([pixels, start, end, on, off])[:, start < end]
+
+    def _positives(self, events: Int64[Tensor, " windows"]) -> Int64[Tensor, " windows"]:
+        """Number of positive events among so many first ones of the index."""
+        return torch.where(events > 0, self.index.positives[(events - 1).clamp(min=0)], 0).long()
+
+
+class _PixelMoments:
+    """Draws pixels, hot ones left out, and instants of the time that is used, all alike; arguments as of samplers."""
+
+    def __init__(self, index: EventIndex, start_ns: int, end_ns: int, stretches: Int64[Tensor, "stretches 2"] | None):
+        self.start_ns, self.end_ns = start_ns, end_ns
+        usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
+        usable[index.hot_pixels] = False
+        self._pixels = usable.nonzero()[:, 0]
+        self._stretches = None
+        if stretches is not None:
+            begins, ends = stretches.clamp(start_ns, end_ns).T
+            used = (stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)
+            if not used.any():
+                raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
+            begins, ends = begins[used], ends[used]
+            after = (ends - begins + 1).cumsum(0)
+            self._stretches = begins, ends, after, int(after[-1])
+
+    def draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | int, Tensor | int]:
+        """Pixels, instants, and the first and the last instant of the stretches that these lie in."""
         device = generator.device
+        pixels = self._pixels[torch.randint(len(self._pixels), (number,), generator=generator, device=device)]
         if self._stretches is None:
-            instant = torch.randint(self.start_ns, self.end_ns + 1, (draws,), generator=generator, device=device)
-            return instant, self.start_ns, self.end_ns
+            instant = torch.randint(self.start_ns, self.end_ns + 1, (number,), generator=generator, device=device)
+            return pixels, instant, self.start_ns, self.end_ns
         begins, ends, after, total = self._stretches
-        place = torch.randint(total, (draws,), generator=generator, device=device)
+        place = torch.randint(total, (number,), generator=generator, device=device)
         stretch = torch.searchsorted(after, place, right=True)
-        return ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
+        return pixels, ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
+
+
+def _with_events(windows: Int64[Tensor, "5 windows"]) -> Int64[Tensor, "5 fired"]:
+    """Those windows in which their pixels fired."""
+    return windows[:, windows[3] + windows[4] > 0]
+
+
+def _silent_pairs(pixels: Tensor, begin: Tensor, end: Tensor, generator: torch.Generator) -> EventBatch:
+    """Pairs of two different instants of each silent interval, given by its first and last instant."""
+    instants = end - begin + 1
+    one = _randint(instants, generator)
+    other = _randint(instants - 1, generator)
+    other += other >= one
+    none = torch.zeros_like(pixels)
+    start, end = begin + torch.minimum(one, other), begin + torch.maximum(one, other)
+    return EventBatch(pixels, start, end, none, none, num_silent=len(pixels))
 
 
 def _last_of_each(
@@ -318,7 +433,7 @@ def _last_of_each(
     return last
 
 
-def _part(times: Int64[Tensor, " times"], stretches: Int64[Tensor, "stretches 2"]) -> Int64[Tensor, " times"]:
+def _part(times: Int64[Tensor, "*times"], stretches: Int64[Tensor, "stretches 2"]) -> Int64[Tensor, "*times"]:
     """Numbers of the parts that stretches cut time into: 0 before the first, 1 within it, 2 in the gap behind it ..."""
     begins, ends = stretches.T.contiguous()
     return torch.searchsorted(begins, times, right=True) + torch.searchsorted(ends, times)

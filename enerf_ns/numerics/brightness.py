@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from enerf_ns.numerics.case import case
-from enerf_ns.sensor.response import Linlog, Logarithm, Response
+from enerf_ns.sensor.response import Gamma, Linlog, Logarithm, Response
 from enerf_ns.sensor.sensor_model import thresholds_from_polarity
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
 from enerf_ns.supervision.losses import no_event_loss, normalised_event_loss
@@ -27,7 +27,8 @@ def knee() -> float:
 @case("brightness of 1e-30, 0 and below", "finite log brightness and gradients under every response")
 def darkness() -> float:
     wrong = 0
-    for response, values in ((Linlog(), [-1.0, -1e-30, 0.0, 1e-30]), (Logarithm(1e-9), [0.0, 1e-30, 1e-12])):
+    negative, dark = [-1.0, -1e-30], [0.0, 1e-30, 1e-12]
+    for response, values in ((Linlog(), negative + dark), (Logarithm(1e-9), dark), (Gamma(2.2, 1e-9), negative + dark)):
         brightness = torch.tensor(values, requires_grad=True)
         changes = response(brightness)
         (gradient,) = torch.autograd.grad(changes.sum(), brightness)
@@ -37,7 +38,7 @@ def darkness() -> float:
 
 @case("log brightness from 0 to 80", "brightness and back, as a share, in float32", 2e-5)
 def back_again() -> float:
-    responses: tuple[Response, ...] = (Linlog(), Logarithm(0.001), Logarithm(1.0))
+    responses: tuple[Response, ...] = (Linlog(), Logarithm(0.001), Logarithm(1.0), Gamma(2.2, 1e-5))
     values = torch.linspace(0.01, 80.0, 4001)
     return max(float(((response(response.inverse(values)) - values) / values).abs().max()) for response in responses)
 

@@ -9,7 +9,7 @@ import torch
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
-from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import AccumulationSampler, EventPairSampler, SilentIntervalSampler, SilentPixelSampler
 from enerf_ns.numerics.case import case
 
 WIDTH, HEIGHT = 8, 4
@@ -49,10 +49,12 @@ def burst_pixels() -> float:
 
 @case("the same, silent pixels", "no event within a silent pair", 0, "events")
 def burst_silence() -> float:
-    index = _burst()
-    batch = SilentPixelSampler(index, *index.span, 1000, 10**8).sample(20_000, torch.Generator().manual_seed(0))
-    within = index.count_until(batch.pixels, batch.end) - index.count_until(batch.pixels, batch.start)
-    return float(within.sum())
+    index, generator = _burst(), torch.Generator().manual_seed(0)
+    within = 0
+    for sampler in (SilentPixelSampler(index, *index.span, 1000, 10**8), SilentIntervalSampler(index)):
+        batch = sampler.sample(20_000, generator)
+        within += int((index.count_until(batch.pixels, batch.end) - index.count_until(batch.pixels, batch.start)).sum())
+    return float(within)
 
 
 @case("all events of a pixel at three instants", "pairs of positive length that count all events", 0, "pairs")
@@ -79,6 +81,7 @@ def clocks() -> float:
         index, seeded = _index(pixels, times + zero), torch.Generator().manual_seed(0)
         batches = [EventPairSampler(index, mode).sample(1000, seeded) for mode in ("successor", "partner", "window")]
         batches.append(SilentPixelSampler(index, *index.span, 10**6, 10**7).sample(1000, seeded))
+        batches.append(AccumulationSampler(index, *index.span, 10**7).sample(1000, seeded))
         return torch.stack([torch.cat([batch.start, batch.end]) - zero for batch in batches])
 
     expected = drawn(0)

@@ -26,7 +26,10 @@ Array = TypeVar("Array", Tensor, np.ndarray)
 """Array type of PyTorch or of NumPy."""
 
 SMALLEST_OFFSET, LARGEST_OFFSET = 1e-9, 1.0
-"""Smallest and largest offset of `Logarithm`."""
+"""Smallest and largest offset of `Logarithm` and of `Gamma`."""
+
+LARGEST_EXPONENT = 3.0
+"""Largest exponent of `Gamma`, whose smallest is 1: to its power, whatever a field renders is finite in float32."""
 
 
 class Response(Protocol):
@@ -84,25 +87,57 @@ class Logarithm:
         return _library(log_brightness).exp(log_brightness) - self.offset
 
 
+@dataclass(frozen=True)
+class Gamma:
+    """ln(brightness^exponent + offset) of brightness that is gamma-encoded, as in pictures (EventNeRF: Rudnev et al.,
+    CVPR 2023).
+
+    A field that is trained with it renders such brightness, and not linear one: `Logarithm` of its power.
+    """
+
+    exponent: float = 2.2
+    offset: float = 1e-5
+
+    @property
+    def name(self) -> str:
+        """Name of the response, as `response_named` reads it."""
+        return f"gamma:{self.exponent!r}:{self.offset!r}"
+
+    def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Log brightness of gamma-encoded brightness; negative values are as dark as 0."""
+        library = _library(brightness)
+        return library.log(library.clip(brightness, 0.0, None) ** self.exponent + self.offset)
+
+    def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Gamma-encoded brightness whose log brightness is the argument."""
+        library = _library(log_brightness)
+        return library.clip(library.exp(log_brightness) - self.offset, 0.0, None) ** (1.0 / self.exponent)
+
+
 def response_named(name: str) -> Response:
-    """The response that a flag or a recording names: `linlog`, or `logarithm:OFFSET` such as `logarithm:0.001`.
+    """The response that a flag or a recording names: `linlog`, `logarithm:OFFSET` such as `logarithm:0.001`, or
+    `gamma:EXPONENT:OFFSET` such as `gamma:2.2:0.1`.
 
     Raises:
-        ValueError: It is neither; a sentence that can follow the name of a file or flag.
+        ValueError: It is none of them; a sentence that can follow the name of a file or flag.
     """
-    kind, _, argument = name.partition(":")
+    kind, *arguments = name.split(":")
+    try:
+        numbers = [float(argument) for argument in arguments]
+    except ValueError:
+        numbers = []
+    fine = bool(numbers) and SMALLEST_OFFSET <= numbers[-1] <= LARGEST_OFFSET
     if name == "linlog":
         return Linlog()
-    try:
-        offset = float(argument)
-    except ValueError:
-        offset = math.nan
-    if kind != "logarithm" or not SMALLEST_OFFSET <= offset <= LARGEST_OFFSET:
-        raise ValueError(
-            f"the response {name!r}, but linlog, or logarithm:OFFSET with an offset from {SMALLEST_OFFSET:g} to "
-            f"{LARGEST_OFFSET:g}, such as logarithm:0.001, was expected."
-        )
-    return Logarithm(offset)
+    if kind == "logarithm" and len(numbers) == 1 and fine:
+        return Logarithm(*numbers)
+    if kind == "gamma" and len(numbers) == 2 and fine and 1.0 <= numbers[0] <= LARGEST_EXPONENT:
+        return Gamma(*numbers)
+    raise ValueError(
+        f"the response {name!r}, but linlog, or logarithm:OFFSET with an offset from {SMALLEST_OFFSET:g} to "
+        f"{LARGEST_OFFSET:g}, such as logarithm:0.001, or gamma:EXPONENT:OFFSET with an exponent from 1 to "
+        f"{LARGEST_EXPONENT:g}, such as gamma:2.2:1e-05, was expected."
+    )
 
 
 def linlog(brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

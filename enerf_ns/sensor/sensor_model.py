@@ -27,7 +27,8 @@ class SensorModelConfig:
     contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """Contrast thresholds C_on and C_off. None: the recording's own, else from the counts of both polarities."""
     response: Optional[str] = None  # noqa: UP045
-    """What a pixel makes of brightness: linlog, or logarithm:OFFSET. None: the recording's own, else linlog."""
+    """What a pixel makes of brightness: linlog, or logarithm:OFFSET; or gamma:EXPONENT:OFFSET, whose field renders
+    gamma-encoded brightness. None: the recording's own, else linlog."""
     refractory_period_ns: Optional[int] = None  # noqa: UP045
     """For how long (ns) a pixel is blind after an event. None: the recording's own."""
     bayer_pattern: Optional[str] = None  # noqa: UP045

@@ -35,7 +35,7 @@ from jaxtyping import Float, Int64
 from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, Events
-from enerf_ns.sensor.response import LINEAR_UNTIL, Logarithm, response_named
+from enerf_ns.sensor.response import LINEAR_UNTIL, Gamma, Logarithm, response_named
 
 READOUT_QUEUE = 1000
 """Events that may wait for the bus; one that comes while so many wait is lost."""
@@ -100,9 +100,14 @@ class SensorSettings:
                 expected = f"two numbers from {least:g} to {largest:g}"
             elif field.name == "response":
                 try:
-                    response_named(value)
+                    response = response_named(value)
                 except ValueError as error:
                     raise FlagError(f"--response names {error}") from error
+                if isinstance(response, Gamma):
+                    raise FlagError(
+                        f"--response is {value}, but a sensor answers linear brightness, which is not gamma-encoded; "
+                        f"give logarithm:{response.offset!r}, which is the same of it."
+                    )
                 continue
             elif field.name == "hot_pixels":
                 fine, expected = 0 <= value <= 1, "between 0 and 1"

@@ -15,7 +15,13 @@ from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.events import samplers as event_sampler
 from enerf_ns.events.batch import EventBatch
-from enerf_ns.events.samplers import EventPairSampler, HeldOutPairSampler, SilentPixelSampler
+from enerf_ns.events.samplers import (
+    AccumulationSampler,
+    EventPairSampler,
+    HeldOutPairSampler,
+    SilentIntervalSampler,
+    SilentPixelSampler,
+)
 from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
 
 WIDTH, HEIGHT = 5, 4
@@ -504,3 +510,128 @@ def test_impossible_pairs_are_refused(arguments: dict) -> None:
 def test_impossible_durations_are_refused(min_duration: int, max_duration: int) -> None:
     with pytest.raises(ValueError, match="at least"):
         SilentPixelSampler(index_of(recording(False)), START, END, min_duration, max_duration)
+
+
+LONGEST = 90
+"""Length of the longest window, in the tests of accumulation."""
+
+
+def window_weights(pixels: dict, start: int, end: int, gaps: bool) -> dict[bool, Counter]:
+    """How likely windows of (pixel, tenth of the time, ninth of the longest length) are, by a loop over all windows:
+    of those with events (True), and of any (False)."""
+    weights = {True: Counter(), False: Counter()}
+    for last in range(start, end + 1):
+        stretch = stretch_of(last)
+        if gaps and stretch is None:
+            continue
+        earliest = max(start, STRETCHES[stretch][0]) if gaps and stretch is not None else start
+        for duration in range(1, LONGEST + 1):
+            first = max(last - duration, earliest)
+            if first == last:
+                continue
+            for pixel in range(WIDTH * HEIGHT):
+                key = pixel, (last - start) * 10 // (end - start + 1), (last - first - 1) * 9 // LONGEST
+                weights[False][key] += 1
+                if any(first < t <= last for t, _ in pixels[pixel]):
+                    weights[True][key] += 1
+    return weights
+
+
+def assert_windows_as_likely(pairs: list[tuple[int, int, int]], weights: Counter, start: int, end: int) -> None:
+    """By pixel and time, and by time and length (chi-square tests); what is expected less than five times is one."""
+    keys = [(pixel, (b - start) * 10 // (end - start + 1), (b - a - 1) * 9 // LONGEST) for pixel, a, b in pairs]
+    for chosen in (slice(2), slice(1, 3)):
+        drawn, expected = Counter(key[chosen] for key in keys), Counter()
+        for key, weight in weights.items():
+            expected[key[chosen]] += weight * len(pairs) / weights.total()
+        assert set(drawn) <= set(expected)
+        rare = [key for key, number in expected.items() if number < 5]
+        cells = [[key] for key in expected if key not in rare] + [rare] * bool(rare)
+        counts, likely = ([sum(of[key] for key in cell) for cell in cells] for of in (drawn, expected))
+        assert chisquare(counts, likely).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+def test_accumulated_windows_are_as_likely_as_a_loop_says(equal_stamps: bool, gaps: bool, device: str) -> None:
+    """Of nine tenths, all windows in which the pixel fired; of the others, all windows."""
+    pixels = recording(equal_stamps)
+    start, end = 300, 700
+    stretches = torch.tensor(STRETCHES, device=device) if gaps else None
+    sampler = AccumulationSampler(index_of(pixels, device), start, end, LONGEST, stretches)
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(0))
+    assert len(pairs) == 20_000 and pairs.num_silent == 0 and pairs.pixels.device.type == device
+    assert {column.dtype for column in pairs.columns} == {torch.int64}
+    assert_counts_are_right(pairs, pixels)
+    drawn = rows(pairs)
+    assert all(start <= a < b <= min(a + LONGEST, end) for _, a, b in drawn)
+    assert not gaps or all(stretch_of(a) == stretch_of(b) is not None for _, a, b in drawn)
+    counts = pairs.on + pairs.off
+    assert counts[:18_000].all() and not counts[18_000:].all()
+    weights = window_weights(pixels, start, end, gaps)
+    assert_windows_as_likely(drawn[:18_000], weights[True], start, end)
+    assert_windows_as_likely(drawn[18_000:], weights[False], start, end)
+
+
+def test_accumulated_windows_leave_hot_pixels_out_and_repeat_with_their_seed() -> None:
+    hot = torch.tensor([0, 8])
+    sampler = AccumulationSampler(replace(index_of(recording(False)), hot_pixels=hot), START, END, LONGEST)
+    one, same, other = (rows(sampler.sample(5000, torch.Generator().manual_seed(seed))) for seed in (3, 3, 4))
+    assert one == same != other
+    assert {pixel for pixel, _, _ in one} == set(range(WIDTH * HEIGHT)) - {0, 8}
+
+
+def test_rare_events_still_fill_a_batch_of_windows_and_none_leave_negatives() -> None:
+    pixels: dict = defaultdict(list, {3: [(500, 1), (501, -1)]})
+    pairs = AccumulationSampler(index_of(pixels), 0, 20_000, 40).sample(1000, torch.Generator().manual_seed(0))
+    assert len(pairs) == 1000 and set(pairs.pixels[:900].tolist()) == {3}
+    assert_counts_are_right(pairs, pixels)
+    pairs = AccumulationSampler(index_of(pixels), 0, 10**12, 40).sample(1000, torch.Generator().manual_seed(0))
+    assert len(pairs) == 100 and not (pairs.on + pairs.off).any()
+
+
+def test_windows_that_cannot_be_drawn_are_refused() -> None:
+    index = index_of({1: [(t, 1) for t in range(200, 330)], 2: [(250, 1)]})
+    with pytest.raises(ValueError, match="outside the gaps of the poses, so there is nothing"):
+        AccumulationSampler(index, *index.span, 10, torch.tensor(STRETCHES))
+    with pytest.raises(ValueError, match="at least 1"):
+        AccumulationSampler(index, *index.span, 0)
+    with pytest.raises(ValueError, match="at two different times"):
+        AccumulationSampler(index_of({1: [(5, 1)]}), 5, 5, 10)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("refractory", [0, 12])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+def test_silent_intervals_lie_between_successive_events(equal_stamps, refractory: int, gaps: bool, device: str) -> None:
+    """Each interval is as likely as the others that hold two instants, and in it each pair of instants."""
+    pixels = recording(equal_stamps)
+    expected = {}
+    for pixel, a, b in all_pairs(pixels, "successor", 1, gaps):
+        first = a + max(refractory, 1)
+        if first < b - 1 and not (gaps and stretch_of(a) != stretch_of(b)):
+            expected[pixel, first, b - 1] = 0
+    stretches = torch.tensor(STRETCHES, device=device) if gaps else None
+    sampler = SilentIntervalSampler(index_of(pixels, device), stretches)
+    pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(0), refractory)
+    assert pairs.num_silent == len(pairs) > 10_000 and not pairs.on.any() and not pairs.off.any()
+    assert_counts_are_right(pairs, pixels)
+    shares = []
+    for pixel, a, b in rows(pairs):
+        ((_, first, last),) = [key for key in expected if key[0] == pixel and key[1] <= a < b <= key[2]]
+        expected[pixel, first, last] += 1
+        instants = last - first + 1
+        shares.append((b - a, instants))
+    assert chisquare([*expected.values()]).pvalue > 1e-3
+    # of n instants, n - d pairs have the distance d: the mean distance is (n + 1) / 3, its variance (n + 1)(n - 2) / 18
+    deviations = [(d - (n + 1) / 3) / ((n + 1) * (n - 2) / 18) ** 0.5 for d, n in shares if n > 2]
+    assert abs(np.sum(deviations)) < 4 * len(deviations) ** 0.5
+
+
+def test_two_instants_of_a_silent_interval_are_uniform() -> None:
+    sampler = SilentIntervalSampler(index_of({pixel: [(t, 1) for t in range(0, 100, 5)] for pixel in range(20)}))
+    pairs = sampler.sample(20_000, torch.Generator().manual_seed(4))
+    drawn = Counter((start % 5, end % 5) for _, start, end in rows(pairs))
+    expected = [(a, b) for a in range(1, 5) for b in range(a + 1, 5)]
+    assert set(drawn) == set(expected)
+    assert chisquare([drawn[pair] for pair in expected]).pvalue > 1e-3

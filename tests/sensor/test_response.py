@@ -9,6 +9,7 @@ import torch
 
 from enerf_ns.sensor.response import (
     ColourFilter,
+    Gamma,
     Linlog,
     Logarithm,
     inverse_linlog,
@@ -111,7 +112,34 @@ def test_a_response_rises_and_its_inverse_undoes_it(response):
     torch.testing.assert_close(response.inverse(levels), brightness, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001)])
+def test_gamma_decodes_brightness_before_the_logarithm():
+    encoded = torch.linspace(0.0, 1.5, 301, dtype=torch.float64)
+    np.testing.assert_allclose(Gamma()(encoded.numpy()), Gamma()(encoded), rtol=0, atol=1e-14)
+    torch.testing.assert_close(Gamma(2.2, 0.1)(encoded), torch.log(encoded**2.2 + 0.1), rtol=0, atol=0)
+    torch.testing.assert_close(Gamma(2.2, 0.1)(encoded), Logarithm(0.1)(encoded**2.2), rtol=0, atol=1e-15)
+    torch.testing.assert_close(Gamma(1.0, 0.01)(encoded), Logarithm(0.01)(encoded), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("offset", [1e-5, 0.1])
+def test_gamma_rises_and_its_inverse_undoes_it(offset: float):
+    response = Gamma(2.2, offset)
+    encoded = torch.linspace(0.01, 2.0, 1001, dtype=torch.float64)
+    assert (response(torch.cat([torch.zeros(1), encoded])).diff() > 0).all()
+    torch.testing.assert_close(response.inverse(response(encoded)), encoded, rtol=0, atol=1e-11)
+    assert response.inverse(response(torch.zeros(1, dtype=torch.float64))).item() == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("exponent", [1.0, 2.2, 3.0])
+def test_gamma_is_finite_in_the_dark_and_in_the_brightest_light_of_a_field(exponent: float, dtype: torch.dtype):
+    brightness = torch.tensor([-1e-7, 0.0, 1e-38, 1e-12, 1.0, math.exp(28.0)], dtype=dtype, requires_grad=True)
+    levels = Gamma(exponent, 1e-9)(brightness)
+    (slope,) = torch.autograd.grad(levels.sum(), brightness)
+    assert levels.isfinite().all() and slope.isfinite().all() and (slope >= 0).all()
+    assert levels[:3].tolist() == pytest.approx([math.log(1e-9)] * 3)
+
+
+@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001), Gamma(2.2, 1e-5), Gamma(2.2, 0.1)])
 def test_the_slope_of_a_response_is_that_of_finite_differences(response):
     brightness = torch.linspace(0.001, 1.5, 40, dtype=torch.float64, requires_grad=True)
     torch.autograd.gradcheck(response, brightness, eps=1e-7, atol=1e-5)
@@ -124,12 +152,16 @@ def test_the_two_responses_in_the_dark():
     assert Linlog()(dark).diff().item() == pytest.approx(255 * 0.005 * math.log(20) / 20)
 
 
-@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001), Logarithm(0.25)])
+@pytest.mark.parametrize("response", [Linlog(), Logarithm(0.001), Logarithm(0.25), Gamma(), Gamma(1.8, 0.1)])
 def test_a_response_is_found_by_its_name(response):
     assert response_named(response.name) == response
 
 
-@pytest.mark.parametrize("name", ["", "log", "linlog:1", "logarithm", "logarithm:", "logarithm:0", "logarithm:nan"])
+@pytest.mark.parametrize(
+    "name",
+    ["", "log", "linlog:1", "logarithm", "logarithm:", "logarithm:0", "logarithm:nan", "logarithm:1:0.1", "gamma",
+     "gamma:2.2", "gamma:2.2:0", "gamma:0.9:0.1", "gamma:3.1:0.1", "gamma:nan:0.1", "gamma:2.2:0.1:1"],
+)  # fmt: skip
 def test_a_response_that_there_is_not_is_refused(name: str):
     with pytest.raises(ValueError, match=r"linlog, or logarithm:OFFSET .* was expected"):
         response_named(name)

@@ -781,6 +781,11 @@ def test_responses_that_no_sensor_has_are_refused(wrong):
         SensorSettings(response=wrong)
 
 
+def test_a_sensor_answers_no_gamma_encoded_brightness():
+    with pytest.raises(FlagError, match=r"^--response is gamma:2.2:0.1, but .* give logarithm:0.1, which .* it\.$"):
+        SensorSettings(response="gamma:2.2:0.1")
+
+
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
 def test_brightness_that_no_picture_has_is_refused(value):
     picture = np.ones((3, 4))
