@@ -343,9 +343,12 @@ class _Resolver:
         self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
 
         name = "model.sensor.response"
-        response = self.use(name, lambda: recording.response or "linlog")
+        stated = recording.response if self.use_frames else None
+        response = self.use(name, lambda: stated or "linlog")
         _check("--pipeline.model.response", lambda: response_named(response))
-        why = "the recording states it" if recording.response else "the response of E-NeRF"
+        why = "the recording states it" if stated else "the response of E-NeRF"
+        if recording.response and not self.use_frames:
+            why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
         self.row("response", self.use_events, response, self.why(name, why), name)
 
         name = "model.sensor.bayer_pattern"

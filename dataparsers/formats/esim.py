@@ -6,7 +6,8 @@
     images/*.png                sharp frames (or .jpg), with images/image_stamps_ns.txt, one stamp a line (optional)
     images_corrupted/*.png      frames blurred by motion, with an image_stamps_ns.txt of their own (optional)
     depth/*.npy                 (height, width) depth in metres of each frame, 0 where nothing was hit (optional)
-    simulation.json             contrast_thresholds, depth_range, exposure_ns and camera of the simulator (optional)
+    simulation.json             contrast_thresholds, response, depth_range, exposure_ns and camera of the simulator
+                                (optional)
 
 One camera takes events and frames, without distortion, and stamps are nanoseconds from the simulation's zero.
 """
@@ -58,12 +59,13 @@ def read(folder: Path) -> EventRecording:
     trajectory = Trajectory(*read_poses(poses_files[0], "ns", notes))
     camera, depth_range = _read_poses_bounds(folder / "poses_bounds.npy")
     simulation_file = folder / "simulation.json"
-    contrast_thresholds, exposure = None, None
+    contrast_thresholds, response, exposure = None, None, None
     if simulation_file.exists():
         simulation = read_json(simulation_file)
         contrast_thresholds = _two_numbers(simulation_file, simulation, "contrast_thresholds")
         depth_range = _two_numbers(simulation_file, simulation, "depth_range") or depth_range
         camera = _simulated_camera(simulation_file, simulation) or camera
+        response = simulation.get("response")
         exposure = parse_nanoseconds(simulation_file, simulation, "exposure_ns")
 
     num_rows = [_num_rows(file) for file in event_files]
@@ -80,6 +82,7 @@ def read(folder: Path) -> EventRecording:
             frames=frames,
             blurred_frames=blurred_frames,
             contrast_thresholds=contrast_thresholds,
+            response=response,
             depth_range=depth_range,
             notes=tuple(notes),
             locate_event=lambda index: _locate(event_files, num_rows, index),
