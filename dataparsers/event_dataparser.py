@@ -20,7 +20,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import RecordingError, exit_with_a_sentence
+from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.recording import EventRecording, Frames
@@ -48,6 +48,9 @@ class EventDataParserConfig(DataParserConfig):
     unless a preset selects frames."""
     train_frames: Literal["blurred", "sharp"] = "blurred"
     """Which frames to train on, where the recording has both; evaluation is always on sharp ones."""
+    exposure_ms: Optional[float] = None  # noqa: UP045
+    """How long the frames to train on were exposed, half of it before and half after their stamps; 0 for an instant.
+    None: the recording's own."""
     depth_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """Nearest and farthest depth of the scene in metres. None: the recording's own, else measured from its events."""
     box: Optional[Tuple[float, float, float, float]] = None  # noqa: UP006, UP045
@@ -141,17 +144,23 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
     """The frames of one split; where the recording has none, instants along its trajectory to picture events at.
 
     Returns:
-        The frames, without those in gaps of the poses, and whether they are some: otherwise, their file names stand for
-        no files.
+        The frames, without those in gaps of the poses, nor, to train on, those whose exposures reach beyond the poses
+        or into gaps; and whether they are some: otherwise, their file names stand for no files.
 
     Raises:
-        RecordingError: All frames lie in gaps of the poses.
+        RecordingError: None is left.
+        FlagError: The exposure that is set is none that the frames can have.
     """
     if held_out and recording.held_out_frames:
         return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     if not held_out and config.train_frames == "blurred" and recording.blurred_frames:
         frames = recording.blurred_frames
+    if not held_out and config.exposure_ms is not None and recording.has_frames:
+        try:
+            frames = frames.with_exposure(round(config.exposure_ms * 1e6))
+        except ValueError as error:
+            raise FlagError(f"event-data --exposure-ms {config.exposure_ms:g} gives {recording.path} {error}") from error
     posed = ~recording.in_left_out_gaps(frames.times)
     if not posed.any():
         raise RecordingError(
@@ -176,7 +185,16 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
         chosen = np.isin(frames.numbers, config.train_frame_indices)
     else:
         chosen = used & ~evaluated
-    return frames.subset(np.flatnonzero(chosen if chosen.any() else used)), recording.has_frames
+    frames = frames.subset(np.flatnonzero(chosen if chosen.any() else used))
+    if held_out or not recording.has_frames:
+        return frames, recording.has_frames
+    known = recording.knows_poses(frames)
+    if not known.any():
+        raise RecordingError(
+            f"The exposures of all frames of {recording.path} to train on reach beyond the poses, or into gaps of them; "
+            "add the poses that are missing, or take the frames as instants with --exposure-ms 0."
+        )
+    return frames.subset(np.flatnonzero(known)), True
 
 
 def event_pictures(recording: EventRecording) -> Frames:

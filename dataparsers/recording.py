@@ -33,6 +33,15 @@ which events beyond number would follow; the largest is a change of brightness b
 DEPTH_LIMITS = (1e-6, 1e9)
 """Least and largest depth, metres."""
 
+EXPOSURE_OVERLAP = 1.1
+"""Largest ratio between exposures and the time from frame to frame; stamps jitter."""
+
+LONGEST_EXPOSURE = 10**15
+"""Exposure, nanoseconds, beyond which all are too long alike."""
+
+SHORTEST_EXPOSURE = 1_000
+"""Shortest exposure, nanoseconds, but for 0; shorter ones are in another unit."""
+
 SHORTEST_FRAME_STEP = 1_000_000
 """Shortest time from frame to frame, nanoseconds; frames closer together than this are in another unit if they also
 span hardly any of the poses."""
@@ -57,7 +66,11 @@ class Events:
 
 @dataclass(frozen=True)
 class Frames:
-    """Pictures, one file each, with the camera that took them."""
+    """Pictures, one file each, with the camera that took them.
+
+    Raises:
+        ValueError: The exposures are not as their field says; a sentence that can follow "FILE holds".
+    """
 
     filenames: tuple[Path, ...]
     times: Int64[np.ndarray, " frames"]
@@ -68,12 +81,29 @@ class Frames:
     depth_filenames: tuple[Path, ...] | None = None
     """Depth maps, .npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was
     hit."""
+    exposures: Int64[np.ndarray, " frames"] | None = None
+    """How long each was exposed, ns: 0 for an instant, else from `SHORTEST_EXPOSURE` to the time from frame to frame.
+    None where that is not known. A frame is the mean of what its camera saw meanwhile."""
     numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Number of each frame in its folder, from 0; counted here unless given."""
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
             object.__setattr__(self, "numbers", np.arange(len(self.times)))
+        if self.exposures is not None:
+            _check_exposures(self.times, self.exposures)
+
+    @property
+    def exposed(self) -> Int64[np.ndarray, "frames 2"]:
+        """First and last instant (ns) of each exposure; twice the time of the frame where it is not known."""
+        exposures = np.zeros_like(self.times) if self.exposures is None else self.exposures
+        opens = self.times - exposures // 2
+        return np.stack([opens, opens + exposures], axis=1)
+
+    def with_exposure(self, exposure: int | None) -> Frames:
+        """The frames, all exposed for as long (ns), or for an unknown time."""
+        exposures = None if exposure is None else np.full(len(self.times), min(exposure, LONGEST_EXPOSURE))
+        return replace(self, exposures=exposures)
 
     def subset(self, indices: Int[np.ndarray, " chosen"]) -> Frames:
         """The frames at the given indices only."""
@@ -83,6 +113,7 @@ class Frames:
             filenames=tuple(self.filenames[i] for i in indices),
             times=self.times[indices],
             depth_filenames=depth,
+            exposures=None if self.exposures is None else self.exposures[indices],
             numbers=self.numbers[indices],
         )
 
@@ -247,6 +278,12 @@ class EventRecording:
         """Which times (ns) lie in gaps of the poses and are therefore not used; none where gaps are kept."""
         return self.trajectory.in_gaps(times) & (not self.keep_pose_gaps)
 
+    def knows_poses(self, frames: Frames) -> Bool[np.ndarray, " frames"]:
+        """Which frames have poses throughout their exposure, outside the gaps that are not used."""
+        opens, closes = frames.exposed.T
+        covered = frames.trajectory.covers(opens) & frames.trajectory.covers(closes)
+        return covered & (self.keep_pose_gaps | ~frames.trajectory.in_gaps(opens, closes))
+
     @property
     def has_frames(self) -> bool:
         """Whether there are frames of any kind."""
@@ -314,6 +351,23 @@ class EventRecording:
         notes.append(left_out(dropped, len(frames.times), what))
         shares[what] = dropped / len(frames.times)
         return frames.subset(inside) if len(inside) else None
+
+
+def _check_exposures(times: Int64[np.ndarray, " frames"], exposures: Int64[np.ndarray, " exposures"]) -> None:
+    if len(exposures) != len(times):
+        raise ValueError(f"{len(exposures)} exposures of {len(times)} frames, but one of each was expected.")
+    wrong = (exposures < 0) | ((0 < exposures) & (exposures < SHORTEST_EXPOSURE))
+    if wrong.any():
+        raise ValueError(
+            f"the exposure {exposures[wrong][0]} ns, but 0, or at least {SHORTEST_EXPOSURE} ns, was expected."
+        )
+    steps, means = np.diff(times), (exposures[:-1] + exposures[1:]) / 2
+    wrong = means > EXPOSURE_OVERLAP * steps
+    if wrong.any():
+        raise ValueError(
+            f"exposures of {means[wrong][0] * 1e-6:g} ms of frames that are {steps[wrong][0] * 1e-6:g} ms apart, but "
+            "exposures up to the time from frame to frame were expected."
+        )
 
 
 def _is_response(name: object) -> bool:

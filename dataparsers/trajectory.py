@@ -105,9 +105,13 @@ class Trajectory:
         before = np.flatnonzero(np.diff(self.times) > self.longest_step)
         return np.stack([self.times[before], self.times[before + 1]], axis=1)
 
-    def in_gaps(self, times: Int64[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
-        """Which times (ns) lie within one of the `gaps`; the poses at its ends are known."""
-        return np.searchsorted(self.gaps[:, 0], times) > np.searchsorted(self.gaps[:, 1], times, "right")
+    def in_gaps(
+        self, times: Int64[np.ndarray, "*batch"], ends: Int64[np.ndarray, "*batch"] | None = None
+    ) -> Bool[np.ndarray, "*batch"]:
+        """Which times (ns), or what from them to the ends (ns), lie within one of the `gaps`; the poses at a gap's ends
+        are known."""
+        ends = times if ends is None else ends
+        return np.searchsorted(self.gaps[:, 0], ends) > np.searchsorted(self.gaps[:, 1], times, "right")
 
     def poses(
         self, times: Int64[Tensor, "*batch"], delays: Float64[Tensor, "*batch"] | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Protocol, TypeVar
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
-from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig
+from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
 from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording
@@ -27,6 +27,7 @@ from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
 from enerf_ns.enerf_model import EnerfModelConfig
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.paper_selections import preset_named, selections
+from enerf_ns.poses.motion import exposure_motion
 from enerf_ns.sensor.response import ColourFilter, response_named
 from enerf_ns.sensor.sensor_model import GREY, thresholds_from_polarity
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
@@ -68,6 +69,12 @@ SMALLEST_GROWTH = 1.4
 
 SHARE_BEYOND = 0.05
 """Share of the events from beyond the box above which there is space there."""
+
+PIXELS_PER_INSTANT = 2.0
+"""Pixels that the picture moves during an exposure for each instant of it that is rendered."""
+
+MOST_INSTANTS = 16
+"""Most instants of an exposure that are chosen to be rendered."""
 
 SEEN_AROUND = math.radians(30)
 """Angle (rad) over which the middle of the scene must be seen before gloss is looked for: within less, what gloss adds
@@ -223,6 +230,7 @@ class _Resolver:
         self._frames()
         self._colour()
         self._box()
+        self._exposure()
         self._grid()
         self._rays()
         self._gloss()
@@ -355,9 +363,12 @@ class _Resolver:
         self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
 
         name = "model.sensor.response"
-        response = self.use(name, lambda: recording.response or "linlog")
+        stated = recording.response if self.use_frames else None
+        response = self.use(name, lambda: stated or "linlog")
         _check("--pipeline.model.response", lambda: response_named(response))
-        why = "the recording states it" if recording.response else "the response of E-NeRF"
+        why = "the recording states it" if stated else "the response of E-NeRF"
+        if recording.response and not self.use_frames:
+            why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
         self.row("response", self.use_events, response, self.why(name, why), name)
 
         name = "model.sensor.bayer_pattern"
@@ -449,6 +460,37 @@ class _Resolver:
         self._contracted = self.use(name, lambda: share > SHARE_BEYOND)
         why = "the box is set" if box is not None else f"{100 * share:.1f} % of the events come from beyond {far:.3g} m"
         self.row("contraction", self._contracted, "space beyond the box" * self._contracted, self.why(name, why), name)
+
+    def _exposure(self) -> None:
+        """Over how many instants of its exposure each frame is averaged."""
+        if not self.use_frames:
+            return
+        name = "datamanager.exposure_samples"
+        parser = Resolution(self.values).applied_to(self.config).datamanager.dataparser
+        assert isinstance(parser, EventDataParserConfig)
+        frames, _ = split_frames(self.recording, parser, held_out=False)
+        if frames.exposures is None:
+            if (self.config.datamanager.exposure_samples or 1) > 1:
+                raise FlagError(
+                    f"{self.recording.path}: the recording states no exposures, but --pipeline.{name.replace('_', '-')} "
+                    "averages over them; state them with event-data --exposure-ms"
+                )
+            why = "the recording states no exposures; --exposure-ms does"
+            self.row("exposure", False, "each frame is taken as an instant", why, f"{DATAPARSER}.exposure_ms")
+            return
+        motion = float(np.median(exposure_motion(frames, *self._depth_range)))
+        instants = self.use(name, lambda: min(max(1, round(motion / PIXELS_PER_INSTANT)), MOST_INSTANTS))
+        value = f"each frame is the mean over {instants} instants" if instants > 1 else "taken as an instant"
+        why = (
+            f"{'set by flag; ' * (parser.exposure_ms is not None)}within {np.median(frames.exposures) * 1e-6:.3g} ms "
+            f"the picture moves by {motion:.3g} pixels"
+        )
+        num_left_out = len(split_frames(self.recording, replace(parser, exposure_ms=0.0), False)[0].times) - len(
+            frames.times
+        )
+        if num_left_out:
+            why += f"; {num_left_out} frames whose exposures reach beyond the poses are left out"
+        self.row("exposure", instants > 1, value, self.why(name, why), name)
 
     def _grid(self) -> None:
         """How fine the scene is."""

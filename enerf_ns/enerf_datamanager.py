@@ -88,8 +88,10 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Share of the recording's time, in 8 equal spans spread evenly over it, at which no pair starts or ends: the
     correlation of events is measured there. 0: none, and it is measured over training pairs."""
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
-    """Pixels of frames drawn at each step, where the field learns from frames. None: 1024, or as the paper for
-    enerf-paper."""
+    """Rays of frames at each step, where the field learns from frames. None: 1024, or as the paper for enerf-paper."""
+    exposure_samples: Optional[int] = None  # noqa: UP045
+    """Instants of its exposure over which a pixel of a frame is averaged; 1: it is taken as seen in the middle. None: as
+    many as the motion during the exposures needs, where they are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -220,9 +222,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)
                 events = events.with_silent(silent)
         if "frames" in config.supervision:
-            assert config.train_num_rays_per_batch is not None
-            indices = self._frame_pixels(config.train_num_rays_per_batch)
-            frames = FrameBatch(indices, self.frame_colours[tuple(indices.T)].float() / 255.0)
+            indices = self._frame_pixels(self._num_frame_pixels)
+            instants = self._frame_instants(indices[:, 0])
+            frames = FrameBatch(indices, instants, self.frame_colours[tuple(indices.T)].float() / 255.0)
         return TrainBatch(events, frames)
 
     def rays(self, batch: TrainBatch, sensor: SensorModel) -> PairedRayBundle:
@@ -231,7 +233,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         if batch.events is not None:
             bundles.append(self.event_rays(batch.events, sensor))
         if batch.frames is not None:
-            bundles.append(self._frame_rays(batch.frames.indices))
+            bundles.append(self._frame_rays(batch.frames.indices, batch.frames.times))
 
         def join(name: str) -> Tensor:
             columns = [
@@ -261,7 +263,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         `next_batch`."""
         assert self.train_pixel_sampler is not None
         indices = self._frame_pixels(self.train_pixel_sampler.num_rays_per_batch)
-        return self._frame_rays(indices), {"indices": indices}
+        return self._frame_rays(indices, self._frame_times[indices[:, :1]]), {"indices": indices}
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         return self.next_train(step)
@@ -270,7 +272,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         """Rays of one training step, of events and frames together."""
         config = self.config
         pairs = (config.event_pairs or 0) + (config.silent_pairs or 0) if "events" in config.supervision else 0
-        return 2 * pairs + ((config.train_num_rays_per_batch or 0) if "frames" in config.supervision else 0)
+        instants = self.config.exposure_samples or 1
+        return 2 * pairs + (self._num_frame_pixels * instants if "frames" in config.supervision else 0)
 
     def _parts(self, stretches: Int64[np.ndarray, "stretches 2"]) -> Tensor | None:
         """First and last instant (ns) of parts of the recording, for samplers; None where they are its span."""
@@ -303,7 +306,32 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         draws = [torch.randint(size, (number,), generator=self.generator, device=self.device) for size in sizes]
         return torch.stack(draws, dim=-1)
 
-    def _frame_rays(self, indices: Tensor) -> RayBundle:
-        frame, row, column = indices.T
-        times = torch.from_numpy(self._frames.times).to(self.device)[frame]
-        return self.frame_camera.rays(row * self._frames.camera.width + column, times)
+    @property
+    def _num_frame_pixels(self) -> int:
+        """Pixels of frames of one training step, of which each has as many rays as instants."""
+        assert self.config.train_num_rays_per_batch is not None
+        return max(1, self.config.train_num_rays_per_batch // (self.config.exposure_samples or 1))
+
+    @cached_property
+    def _frame_times(self) -> Tensor:
+        return torch.from_numpy(self._frames.times).to(self.device)
+
+    @cached_property
+    def _frame_exposures(self) -> Tensor:
+        return torch.from_numpy(self._frames.exposed).to(self.device)
+
+    def _frame_instants(self, frames: Tensor) -> Tensor:
+        """Instants (ns) at which pixels of these frames are rendered, shape (pixels, instants): one in the middle of
+        the exposure, or one drawn evenly from each of as many equal parts of it."""
+        number = self.config.exposure_samples or 1
+        if number == 1:
+            return self._frame_times[frames, None]
+        opens, closes = self._frame_exposures[frames, :, None].unbind(1)
+        draws = torch.rand(len(frames), number, generator=self.generator, device=self.device, dtype=torch.float64)
+        parts = (torch.arange(number, device=self.device) + draws) / number
+        return opens + (parts * (closes - opens)).long()
+
+    def _frame_rays(self, indices: Tensor, times: Tensor) -> RayBundle:
+        _, row, column = indices.T
+        pixels = row * self._frames.camera.width + column
+        return self.frame_camera.rays(pixels.repeat_interleave(times.shape[1]), times.flatten())

@@ -52,6 +52,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "warmup_steps": (0, MOST_STEPS - 1),
     "max_steps": (1, MOST_STEPS),
     "held_out_every": (1, 10**9),
+    "exposure_ms": (0.0, 1e6),
     "depth_range": DEPTH_LIMITS,
     "box": (-DEPTH_LIMITS[1], DEPTH_LIMITS[1]),
     "time_range": (-4e9, 4e9),  # in ns, differences of int64 hold them
@@ -64,6 +65,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "held_out_events": (0.0, 0.5),
     "silence_ms": (2e-6, 1e9),  # from 2 ns, which two instants need
     "train_num_rays_per_batch": (1, MOST_DRAWS),
+    "exposure_samples": (1, 4096),
     "eval_num_rays_per_batch": (1, MOST_DRAWS),
     "train_num_images_to_sample_from": (-1, 10**9),  # -1: all
     "train_num_times_to_repeat_images": (-1, 10**9),

@@ -122,7 +122,8 @@ def changed(
     trajectory = Trajectory(moved(old.times), positions, old.quaternions)
 
     def frames(old: Frames | None) -> Frames | None:
-        return old and replace(old, times=moved(old.times), trajectory=trajectory)
+        exposures = None if old is None or old.exposures is None else old.exposures * slower // faster
+        return old and replace(old, times=moved(old.times), trajectory=trajectory, exposures=exposures)
 
     return replace(
         recording,

@@ -15,6 +15,7 @@ from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, small_config
 
 from enerf_ns.choices import Choice, Resolution, is_colour, resolve
 from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording, Events
@@ -135,11 +136,15 @@ def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp
 
 
 def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_path: Path):
+    """The response where frames fix brightness: events alone are learnt from better with E-NeRF's."""
     stated = replace(
         read_recording(recording), response="logarithm:0.01", refractory_period=3_000_000, bayer_pattern="RGGB"
     )
-    resolution = resolve(ENERF, stated)
-    sensor = resolution.applied_to(ENERF).model.sensor.setup()
+    config = copy.deepcopy(ENERF)
+    assert resolve(config, stated).values["model.sensor.response"] == "linlog"
+    config.datamanager.supervision = "events+frames"
+    resolution = resolve(config, stated)
+    sensor = resolution.applied_to(config).model.sensor.setup()
     assert sensor.response == Logarithm(0.01) and sensor.refractory_period == 3_000_000
     assert sensor.colour_filter is not None and resolution.values["model.num_channels"] == 3
     assert resolution.values["datamanager.pair_mode"] == "successor"
@@ -235,6 +240,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "high dynamic range": ("exponential", "log-sigmoid"),
         "frame loss": ("events+frames", "events"),
         "second camera": ("events+frames", "events"),
+        "exposure": (3, 1),
         "colour": (3, 1),
         "undistortion": (True, False),
         "contraction": (True, False),
@@ -253,6 +259,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         *parents, name = default[part].flag.replace("event-data --", "pipeline.datamanager.dataparser.").split(".")
         for value, kept in zip(answers, (True, False), strict=True):
             config = copy.deepcopy(ENERF)
+            config.datamanager.supervision = "events+frames"
             owner = config
             for parent in [parent.strip("-") for parent in parents][1:]:
                 owner = getattr(owner, parent)
@@ -265,6 +272,59 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
                 assert row is not None and not row.kept
             else:
                 assert (row is not None and row.kept) == kept, (part, value)
+
+
+def frames_config(supervision: str = "frames", **changes: Any) -> Any:
+    config = copy.deepcopy(ENERF)
+    config.datamanager.supervision = supervision
+    for name, value in changes.items():
+        setattr(config.datamanager if hasattr(config.datamanager, name) else config.datamanager.dataparser, name, value)
+    return config
+
+
+@pytest.mark.parametrize(("speed", "instants"), [(0.0, 1), (4.0, 1), (12.0, 5), (1000.0, 16)])
+def test_a_frame_is_rendered_once_for_every_two_pixels_that_it_moves(recording: Path, speed: float, instants: int):
+    """A slide of `speed` m/s, in which points at 1 m move by focal length * speed * 5 ms."""
+    whole = read_recording(recording)
+    times = whole.trajectory.times
+    positions = (times * 1e-9)[:, None] * [speed, 0.0, 0.0]
+    slide = Trajectory(times, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1)))
+    frames = replace(whole.blurred_frames, trajectory=slide)  # type: ignore[type-var]
+    sliding = replace(whole, frames=None, blurred_frames=frames)
+    resolution = resolve(frames_config(depth_range=(1.0, 4.0)), sliding)
+    assert resolution.values["datamanager.exposure_samples"] == instants
+    row, motion = rows(resolution)["exposure"], whole.camera.fx * speed * 0.005
+    assert row.kept == (instants > 1)
+    assert f"within 5 ms the picture moves by {motion:.3g} pixels" in row.why
+    assert instants in (1, 16) or instants == round(motion / 2)
+
+
+def test_frames_whose_exposures_are_not_known_are_instants_unless_they_are_stated(recording: Path):
+    whole = read_recording(recording)
+    unknown = replace(whole, blurred_frames=replace(whole.blurred_frames, exposures=None))  # type: ignore[type-var]
+    row = rows(resolve(frames_config(), unknown))["exposure"]
+    assert not row.kept and row.flag == "event-data --exposure-ms" and "--exposure-ms" in row.why
+    with pytest.raises(FlagError, match=r"recording states no exposures.*exposure-samples averages.*--exposure-ms"):
+        resolve(frames_config(exposure_samples=4), unknown)
+    assert "datamanager.exposure_samples" not in resolve(frames_config(exposure_samples=1), unknown).values
+    stated = resolve(frames_config(exposure_ms=5.0), unknown)
+    known = resolve(frames_config(), whole)
+    assert stated.values["datamanager.exposure_samples"] == known.values["datamanager.exposure_samples"] > 1
+    assert rows(stated)["exposure"].why.startswith("set by flag; within 5 ms")
+
+
+def test_sharp_frames_are_instants(recording: Path):
+    resolution = resolve(frames_config(train_frames="sharp"), read_recording(recording))
+    assert resolution.values["datamanager.exposure_samples"] == 1 and not rows(resolution)["exposure"].kept
+
+
+@pytest.mark.parametrize(
+    ("exposure_ms", "message"),
+    [(20.0, "--exposure-ms 20 gives .* exposures of 20 ms of frames that are 9.09"), (1e-4, "the exposure 100 ns, but")],
+)
+def test_an_exposure_that_no_frame_can_have_is_refused(recording: Path, exposure_ms: float, message: str):
+    with pytest.raises(FlagError, match=message):
+        resolve(frames_config(exposure_ms=exposure_ms), read_recording(recording))
 
 
 def test_a_lens_may_be_ignored(recording: Path):

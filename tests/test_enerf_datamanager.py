@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import torch
 from small_runs import HEIGHT, WIDTH, set_up, small_config
 
 from enerf_ns.dataparsers.files import load_image
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import SCENES
 
 
 def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: Path):
@@ -20,6 +23,7 @@ def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: P
         data__supervision="events+frames",
         data__silent_pairs=10,
         data__train_num_rays_per_batch=20,
+        data__exposure_samples=1,
     )
     pipeline = set_up(config).pipeline
     manager = pipeline.datamanager
@@ -31,7 +35,7 @@ def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: P
     counts = events.on + events.off
     assert len(counts[events.fired]) == 64 and counts[events.fired].all() and not counts[events.silent].any()
     assert len(frames.colours) == 20
-    parts = batch.split(torch.arange(len(rays))[:, None])
+    parts = batch.split(torch.arange(float(len(rays)))[:, None])
     assert [len(part) for part in parts] == [74, 74, 20] and torch.cat(parts).flatten().tolist() == [*range(168)]
 
     files = manager.train_dataset.frames.filenames
@@ -43,6 +47,73 @@ def test_a_step_holds_what_the_recording_saw(colour_recording: Path, tmp_path: P
     expected = manager.train_dataset.cameras.generate_rays(camera_indices=frame[:, None], coords=coordinates)
     torch.testing.assert_close(rays.origins[-20:], expected.origins, rtol=0, atol=1e-6)
     torch.testing.assert_close(rays.directions[-20:], expected.directions, rtol=0, atol=1e-6)
+
+
+def test_the_rays_of_a_frame_are_those_of_one_instant_of_each_part_of_its_exposure(recording: Path, tmp_path: Path):
+    """As many rays as without exposures, of fewer pixels; against rays of the camera at those instants."""
+    config = small_config(
+        recording,
+        tmp_path,
+        data__supervision="frames",
+        data__train_num_rays_per_batch=400,
+        data__exposure_samples=4,
+    )
+    pipeline = set_up(config).pipeline
+    manager = pipeline.datamanager
+    batch = manager.next_batch(pipeline.model.sensor)
+    frames, rays = batch.frames, manager.rays(batch, pipeline.model.sensor)
+    assert frames.times.shape == (100, 4) and len(rays) == manager.get_train_rays_per_batch() == 400
+    begins = torch.from_numpy(manager.train_dataset.frames.times)[frames.indices[:, :1]] - 2_500_000
+    parts = (frames.times - begins) / 1_250_000
+    assert (parts.floor() == torch.arange(4)).all()
+    assert 0.4 < (parts % 1).mean() < 0.6 and (parts % 1).min() < 0.05 and (parts % 1).max() > 0.95
+
+    _, row, column = frames.indices.T
+    for instant in range(4):
+        expected = manager.frame_camera.rays(row * WIDTH + column, frames.times[:, instant])
+        torch.testing.assert_close(rays.origins[instant::4], expected.origins, rtol=0, atol=0)
+        torch.testing.assert_close(rays.directions[instant::4], expected.directions, rtol=0, atol=0)
+
+
+def test_the_mean_over_the_instants_is_what_the_simulated_camera_recorded(recording: Path, tmp_path: Path):
+    """Pixels of blurred frames against the scene itself, rendered sharply from where the camera is at each instant."""
+    config = small_config(
+        recording,
+        tmp_path,
+        data__supervision="frames",
+        data__train_num_rays_per_batch=24 * 16,
+        data__exposure_samples=16,
+    )
+    pipeline = set_up(config).pipeline
+    manager = pipeline.datamanager
+    batch, camera = manager.next_batch(pipeline.model.sensor), manager.recording.camera
+    scene_rng, _ = np.random.default_rng(0).spawn(2)
+    renderer = Renderer(SCENES["shapes"](scene_rng), camera)
+    poses = manager.recording.trajectory.poses(batch.frames.times).numpy()
+    seen = torch.tensor(
+        [
+            [renderer.brightness(pose)[row, column] for pose in instants]
+            for instants, (_, row, column) in zip(poses, batch.frames.indices.tolist(), strict=True)
+        ]
+    )
+    rendered = batch.split(seen.flatten()[:, None].expand(-1, 3))[2]
+    assert (rendered[:, 0] - seen[:, 8]).abs().max() > 0.1  # there is blur
+    torch.testing.assert_close(rendered.float(), batch.frames.colours, rtol=0, atol=0.03)
+
+
+def test_without_exposures_and_with_one_instant_training_is_as_it_was(recording: Path, tmp_path: Path):
+    """To the bit: one ray a pixel at the time of the frame, and no other random numbers."""
+
+    def losses(**changes: Any) -> list[float]:
+        config = small_config(recording, tmp_path, data__supervision="frames", **changes)
+        config.pipeline.datamanager.dataparser.exposure_ms = 0.0 if not changes else None
+        trainer = set_up(config)
+        frames = trainer.pipeline.datamanager.next_batch(trainer.pipeline.model.sensor).frames
+        times = torch.from_numpy(trainer.pipeline.datamanager.train_dataset.frames.times)
+        assert (frames.times == times[frames.indices[:, :1]]).all()
+        return [trainer.train_iteration(step)[0].item() for step in range(3)]
+
+    assert losses() == losses(data__exposure_samples=1)
 
 
 def test_pairs_that_cannot_be_drawn_are_an_error_of_one_sentence(recording: Path, tmp_path: Path):

@@ -6,7 +6,8 @@
     images/*.png                sharp frames (or .jpg), with images/image_stamps_ns.txt, one stamp a line (optional)
     images_corrupted/*.png      frames blurred by motion, with an image_stamps_ns.txt of their own (optional)
     depth/*.npy                 (height, width) depth in metres of each frame, 0 where nothing was hit (optional)
-    simulation.json             contrast_thresholds, depth_range and camera of the simulator (optional)
+    simulation.json             contrast_thresholds, response, depth_range, exposure_ns and camera of the simulator
+                                (optional)
 
 One camera takes events and frames, without distortion, and stamps are nanoseconds from the simulation's zero.
 """
@@ -25,7 +26,7 @@ from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import in_colour, load_array, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
-from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
+from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import EventFiles, GrowingArray, Writer, encode_npy, encode_poses, poses_at
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
@@ -58,17 +59,19 @@ def read(folder: Path) -> EventRecording:
     trajectory = Trajectory(*read_poses(poses_files[0], "ns", notes))
     camera, depth_range = _read_poses_bounds(folder / "poses_bounds.npy")
     simulation_file = folder / "simulation.json"
-    contrast_thresholds = None
+    contrast_thresholds, response, exposure = None, None, None
     if simulation_file.exists():
         simulation = read_json(simulation_file)
         contrast_thresholds = _two_numbers(simulation_file, simulation, "contrast_thresholds")
         depth_range = _two_numbers(simulation_file, simulation, "depth_range") or depth_range
         camera = _simulated_camera(simulation_file, simulation) or camera
+        response = simulation.get("response")
+        exposure = parse_nanoseconds(simulation_file, simulation, "exposure_ns")
 
-    frames = _read_frames(folder / "images", camera, trajectory)
-    blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory)
     num_rows = [_num_rows(file) for file in event_files]
     with of_file(simulation_file):
+        frames = _read_frames(folder / "images", camera, trajectory, None if exposure is None else 0)
+        blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory, exposure)
         return EventRecording(
             path=folder,
             format="esim",
@@ -79,6 +82,7 @@ def read(folder: Path) -> EventRecording:
             frames=frames,
             blurred_frames=blurred_frames,
             contrast_thresholds=contrast_thresholds,
+            response=response,
             depth_range=depth_range,
             notes=tuple(notes),
             locate_event=lambda index: _locate(event_files, num_rows, index),
@@ -118,10 +122,11 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
         return Camera(*numbers.tolist())
 
 
-def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory) -> Frames | None:
+def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, exposure: int | None) -> Frames | None:
     files = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     depth_files = sorted((folder.parent / "depth").glob("*.npy"))
-    return read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
+    frames = read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
+    return frames and frames.with_exposure(exposure)
 
 
 def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:

@@ -6,8 +6,9 @@
                                      bayer_pattern, response, depth_range
     camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
-                                     each exposure (optional)
-    blurred_frames/*.png             frames blurred by motion, with a stamps_ns.txt of their own (optional)
+                                     each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
+                                     (both optional)
+    blurred_frames/*.png             frames blurred by motion, with such tables of their own (optional)
     depth/*.npy                      (height, width) depth in metres of each sharp frame, 0 where nothing is (optional)
 
 All times are nanoseconds on one clock, from any zero.
@@ -33,7 +34,7 @@ from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import load_array, of_file, read_json, write_whole
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
-from enerf_ns.dataparsers.formats.json_values import parse_numbers, shown
+from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
@@ -56,6 +57,7 @@ FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
 )
+EXPOSURES_NAME = "exposures_ns.txt"
 STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
 
 LATEST = 2**62
@@ -100,7 +102,7 @@ def read(folder: Path) -> EventRecording:
                 path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
             ),
             depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
-            refractory_period=_parse_refractory_period(path, about),
+            refractory_period=parse_nanoseconds(path, about, "refractory_period_ns") or 0,
             bayer_pattern=about.get("bayer_pattern"),
             response=about.get("response"),
             notes=tuple(notes),
@@ -388,7 +390,7 @@ def _read_frames(
 ) -> Frames | None:
     kinds = Image.registered_extensions()
     files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
-    return read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files)
+    return read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files, folder / EXPOSURES_NAME)
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
@@ -399,6 +401,8 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
     for name, source in zip(names, frames.filenames, strict=True):
         shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
     (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
+    if frames.exposures is not None:
+        (folder / EXPOSURES_NAME).write_text("".join(f"{exposure}\n" for exposure in frames.exposures.tolist()))
     if frames.depth_filenames and folder.name == "frames":
         depth_folder.mkdir()
         for name, source in zip(names, frames.depth_filenames, strict=True):
@@ -423,15 +427,6 @@ def _parse_two(path: Path, about: dict, name: str, expected: str) -> tuple[float
     return first, second
 
 
-def _parse_refractory_period(path: Path, about: dict) -> int:
-    period = about.get("refractory_period_ns", 0)
-    if type(period) is not int:
-        raise RecordingError(
-            f"{path} holds refractory_period_ns = {shown(period)}, but a whole number of nanoseconds was expected."
-        )
-    return period
-
-
 def _list(names: tuple[str, ...] | list[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
@@ -442,6 +437,11 @@ class EventRecordingWriter(Writer):
     layout = "event_recording"
     frame_folders = ("frames", "blurred_frames")
     stamps_name = "stamps_ns.txt"
+
+    def _stamps(self, time: int) -> dict[str, str]:
+        exposures = (0, self.setup.exposure) if self.setup.exposure else (0,)
+        folders = zip(self.frame_folders, exposures, strict=False)
+        return super()._stamps(time) | {f"{folder}/{EXPOSURES_NAME}": f"{exposure}\n" for folder, exposure in folders}
 
     def _check(self) -> None:
         if self.setup.frame_camera.model == "lookup":

@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, load_array
-from enerf_ns.dataparsers.formats.text_tables import read_times
-from enerf_ns.dataparsers.recording import Frames
+from enerf_ns.dataparsers.files import check_image_size, load_array, of_file
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows, read_times
+from enerf_ns.dataparsers.recording import LONGEST_EXPOSURE, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 
 def read_frames(
-    files: Sequence[Path], stamps_file: Path, camera: Camera, trajectory: Trajectory, depth_files: Sequence[Path] = ()
+    files: Sequence[Path],
+    stamps_file: Path,
+    camera: Camera,
+    trajectory: Trajectory,
+    depth_files: Sequence[Path] = (),
+    exposures_file: Path | None = None,
 ) -> Frames | None:
     """Frames of one camera; of images and depth maps, only the headers are read.
 
@@ -24,13 +31,14 @@ def read_frames(
         camera: Of all of them.
         trajectory: Of this camera.
         depth_files: .npy, one for each frame, or none.
+        exposures_file: One exposure (ns) a line, in the order of the stamps; may be missing.
 
     Returns:
         None where there are neither images nor stamps.
 
     Raises:
-        RecordingError: There are not as many stamps or depth maps as images, or one of them cannot be read or is of
-            another size than the camera's.
+        RecordingError: There are not as many stamps, exposures or depth maps as images, or one of them cannot be read,
+            is of another size than the camera's, or is no exposure that a frame can have.
     """
     if not files and not stamps_file.exists():
         return None
@@ -54,4 +62,10 @@ def read_frames(
                 f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
                 f"{(camera.height, camera.width)}."
             )
-    return Frames(tuple(files), times, camera, trajectory, tuple(depth_files) or None)
+    exposures = None
+    if exposures_file is not None and exposures_file.exists():
+        rows, numbers = read_rows(exposures_file, "exposure_ns")
+        values = parse_numbers(exposures_file, rows, numbers)[:, 0].clip(-LONGEST_EXPOSURE, LONGEST_EXPOSURE)
+        exposures = np.copysign(np.ceil(np.abs(values)), values).astype(np.int64)  # a fraction must not become 0
+    with of_file(exposures_file or stamps_file):
+        return Frames(tuple(files), times, camera, trajectory, tuple(depth_files) or None, exposures)

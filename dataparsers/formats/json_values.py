@@ -35,6 +35,18 @@ def parse_numbers(
         raise RecordingError(f"{path} holds {name} = {shown(value)}, but {expected} were expected.") from error
 
 
+def parse_nanoseconds(path: Path, about: dict, name: str) -> int | None:
+    """The whole number of nanoseconds that a JSON file holds under a name; None where it holds none.
+
+    Raises:
+        RecordingError: The value is something else.
+    """
+    value = about.get(name)
+    if name in about and type(value) is not int:
+        raise RecordingError(f"{path} holds {name} = {shown(value)}, but a whole number of nanoseconds was expected.")
+    return value
+
+
 def parse_array(value: object, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
     """Finite numbers of this shape from nested lists.
 

@@ -157,7 +157,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     pose_times, positions, quaternions = read_poses(poses_file, "us", notes)
     _check_unit(poses_file, pose_times, longest=len(pose_times) * 10**9)
     longest = LARGEST_SPAN_RATIO * int(pose_times[-1] - pose_times[0])
-    frame_files, stamps, frame_times = _read_frames(images, event_camera, longest, notes)
+    frame_files, stamps, frame_times, exposures = _read_frames(images, event_camera, longest, notes)
     zero = int(min(events.first_time, pose_times[0], *stamps[:1]))
 
     if is_prepared:
@@ -169,7 +169,10 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     frames = None
     if rig.frame_camera is not None:
         frame_trajectory = markers.of_mounted(marker_from_imu @ rig.imu_from_frame_camera)
-        frames = Frames(frame_files, frame_times - zero, rig.frame_camera, frame_trajectory)
+        with of_file(images):
+            frames = Frames(
+                frame_files, frame_times - zero, rig.frame_camera, frame_trajectory, exposures=exposures
+            )
     return EventRecording(
         path=folder,
         format="tum_vie",
@@ -209,12 +212,15 @@ def _data_folder(folder: Path, sequence: str) -> Path:
 
 def _read_frames(
     folder: Path, side: str, longest: int, notes: list[str]
-) -> tuple[tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"]]:
-    """Files, stamps, and the middles of the exposures (ns on the clock of the data set, over at most `longest`)."""
+) -> tuple[
+    tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"] | None
+]:
+    """Files, stamps, the middles of the exposures (ns on the clock of the data set, over at most `longest`), and how
+    long those are (ns), where that is known."""
     files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
     stamps_file = _here_or_above(folder, f"image_timestamps_{side}.txt")
     if not files and not stamps_file.exists():
-        return (), np.zeros(0, np.int64), np.zeros(0, np.int64)
+        return (), np.zeros(0, np.int64), np.zeros(0, np.int64), None
     stamps = read_times(stamps_file, "us")
     if len(stamps) != len(files):
         raise RecordingError(
@@ -224,7 +230,7 @@ def _read_frames(
     exposures_file = _here_or_above(folder, f"image_exposures_{side}.txt")
     if not exposures_file.exists():
         notes.append(f"{exposures_file.name} is missing, so frames have the poses at their stamps.")
-        return files, stamps, stamps
+        return files, stamps, stamps, None
 
     rows, numbers = read_rows(exposures_file, "exposure_us")
     exposures = parse_numbers(exposures_file, rows, numbers)[:, 0]
@@ -240,7 +246,7 @@ def _read_frames(
             f"{exposures_file} holds exposures from {exposures.min():g} to {exposures.max():g} us, which do not fit "
             f"frames at most {gap:g} us apart; exposures in microseconds were expected."
         )
-    return files, stamps, middles
+    return files, stamps, middles, np.rint(exposures * 1000).astype(np.int64)
 
 
 def _here_or_above(folder: Path, name: str) -> Path:

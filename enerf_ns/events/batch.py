@@ -57,22 +57,24 @@ class EventBatch:
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Pixels of frames."""
+    """Pixels of frames, each the mean of what it saw at instants of its exposure."""
 
-    indices: Int64[Tensor, "rays 3"]
+    indices: Int64[Tensor, "pixels 3"]
     """Frame, row and column of each pixel."""
-    colours: Float[Tensor, "rays 3"]
+    times: Int64[Tensor, "pixels instants"]
+    """Instants at which each pixel is rendered, ns."""
+    colours: Float[Tensor, "pixels 3"]
     """Colours that were recorded at the pixels, in [0, 1]."""
 
-    def subset(self, chosen: Bool[Tensor, " rays"]) -> FrameBatch:
+    def subset(self, chosen: Bool[Tensor, " pixels"]) -> FrameBatch:
         """The pixels that are chosen."""
-        return FrameBatch(self.indices[chosen], self.colours[chosen])
+        return FrameBatch(self.indices[chosen], self.times[chosen], self.colours[chosen])
 
 
 @dataclass(frozen=True)
 class TrainBatch:
     """A batch of events, of frames, or of both. Its rays are rendered in one go: all starts, all ends, all pixels of
-    frames."""
+    frames, of each pixel all instants."""
 
     events: EventBatch | None
     frames: FrameBatch | None
@@ -83,6 +85,10 @@ class TrainBatch:
         return 0 if self.events is None else len(self.events)
 
     def split(self, rendered: Float[Tensor, "rays channels"]) -> tuple[Tensor, Tensor, Tensor]:
-        """What was rendered at the first instants (pairs, channels), at the second ones, and of the frames."""
+        """What was rendered at the first instants (pairs, channels), at the second ones, and of the frames (pixels,
+        channels), whose light adds up over their instants."""
         pairs = self.num_pairs
-        return rendered[:pairs], rendered[pairs : 2 * pairs], rendered[2 * pairs :]
+        frames = rendered[2 * pairs :]
+        if self.frames is not None:
+            frames = frames.unflatten(0, self.frames.times.shape).mean(dim=1)
+        return rendered[:pairs], rendered[pairs : 2 * pairs], frames

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,18 +14,22 @@ from geometry import distance_to_rays, unproject
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from recordings import EVENTS, FRAME_TIMES, POSE_TIMES, poses, write_davis, write_esim
+from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis, write_esim
 from scipy.interpolate import CubicSpline
 
 from enerf_ns.dataparsers import event_dataparser
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.event_dataparser import (
     EventDataParserConfig,
+    split_frames,
 )
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.poses.posed_camera import PosedCamera
@@ -143,6 +148,47 @@ def test_training_frames_are_blurred_by_default_and_evaluation_is_always_on_shar
         "sharp": {"images"},
     }[choice]
     assert {file.parent.name for file in parse(folder, "test").image_filenames} == {"images"}
+
+
+def test_frames_exposed_beyond_the_poses_are_not_trained_on_but_are_evaluated(tmp_path: Path):
+    """Poses from 0 to 1 s; frames at 0.15, 0.45 and 0.75 s."""
+    folder = write_esim(tmp_path / "esim", frames=("images", "images_corrupted"))
+    trained = {
+        exposure: parse(folder, exposure_ms=exposure, held_out_every=2).metadata["frames"].times.tolist()
+        for exposure in (0.0, 290.0, 310.0)
+    }
+    first, middle, last = FRAME_TIMES.tolist()
+    assert trained == {0.0: [first, last], 290.0: [first, last], 310.0: [last]}
+    assert parse(folder, "test", exposure_ms=310.0, held_out_every=2).metadata["frames"].times.tolist() == [middle]
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_frames_exposed_within_gaps_of_the_poses_are_not_trained_on(keep: bool):
+    """A gap from 2 to 3 s; exposures of 80 ms that end where it begins, reach into it, lie in it and begin at its
+    end."""
+    pose_times = np.concatenate([np.arange(0, 201), np.arange(300, 501)]) * 10_000_000
+    positions = np.linspace(0, 1, len(pose_times))[:, None] * [1.0, 0.0, 0.0]
+    trajectory = Trajectory(pose_times, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(pose_times), 1)))
+    times = np.array([1_000, 1_960, 2_500, 2_990, 3_040, 4_000]) * 1_000_000
+    camera = Camera(WIDTH, HEIGHT, 20.0, 20.0, 12.0, 9.0)
+    frames = Frames(tuple(map(Path, map(str, times))), times, camera, trajectory).with_exposure(40_000_000)
+    into = replace(frames, times=times + np.array([0, 30, 0, 0, 0, 0]) * 1_000_000)
+    for given, outside in ((frames, [2, 3]), (into, [1, 2, 3])):
+        recording = EventRecording(Path("r"), "test", camera, trajectory, lambda: iter([]), (), blurred_frames=given)
+        recording = recording.selected(None, False, keep)
+        config = EventDataParserConfig(train_frame_indices=tuple(range(6)), held_out_frame_indices=())
+        kept, _ = split_frames(recording, config, held_out=False)
+        assert kept.numbers.tolist() == [i for i in range(6) if keep or i not in outside]
+
+
+def test_frames_none_of_which_has_poses_throughout_are_an_error_of_one_sentence(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim", frames=("images_corrupted",))
+    frames = read_recording(folder).blurred_frames
+    assert frames is not None
+    alone = replace(read_recording(folder), blurred_frames=frames.subset(np.array([0])))
+    with pytest.raises(RecordingError, match="reach beyond the poses.*--exposure-ms 0") as error:
+        split_frames(alone, EventDataParserConfig(exposure_ms=5000.0), held_out=False)
+    assert "\n" not in str(error.value)
 
 
 def test_a_recording_without_frames_has_cameras_along_its_trajectory_with_pictures_of_events(tmp_path: Path):

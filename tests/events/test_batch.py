@@ -24,14 +24,28 @@ def test_a_subset_knows_which_of_its_pairs_are_silent():
     assert subset.pixels[subset.fired].tolist() == [0, 2] and subset.off[subset.silent].tolist() == [105]
 
 
+def frames_of(pixels: int, instants: int) -> FrameBatch:
+    times = torch.zeros(pixels, instants, dtype=torch.int64)
+    return FrameBatch(torch.zeros(pixels, 3, dtype=torch.int64), times, torch.zeros(pixels, 3))
+
+
 def test_what_was_rendered_is_taken_apart_as_its_rays_were_put_together():
-    frames = FrameBatch(torch.zeros(4, 3, dtype=torch.int64), torch.zeros(4, 3))
-    rendered = torch.arange(14)[:, None]
-    parts = TrainBatch(events(5, 0, False), frames).split(rendered)
+    rendered = torch.arange(14.0)[:, None]
+    parts = TrainBatch(events(5, 0, False), frames_of(4, 1)).split(rendered)
     assert [part.flatten().tolist() for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9], [10, 11, 12, 13]]
 
 
+def test_what_a_frame_shows_is_the_mean_over_its_instants():
+    rendered = torch.tensor([[0.0, 5.0], [1.0, 5.0], [2.0, 0.0], [4.0, 6.0], [9.0, 0.0], [20.0, 0.0], [1.0, 3.0], [0.0, 0.0]])
+    parts = TrainBatch(events(1, 0, False), frames_of(2, 3)).split(rendered)
+    assert [part.tolist() for part in parts] == [[[0, 5]], [[1, 5]], [[5, 2], [7, 1]]]
+
+
+def test_one_instant_is_shown_to_the_bit():
+    rendered = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
+    assert (TrainBatch(None, frames_of(100, 1)).split(rendered)[2] == rendered).all()
+
+
 def test_without_events_all_is_frames_and_without_frames_all_is_events():
-    frames = FrameBatch(torch.zeros(4, 3, dtype=torch.int64), torch.zeros(4, 3))
-    assert [len(part) for part in TrainBatch(None, frames).split(torch.zeros(4, 1))] == [0, 0, 4]
+    assert [len(part) for part in TrainBatch(None, frames_of(4, 1)).split(torch.zeros(4, 1))] == [0, 0, 4]
     assert [len(part) for part in TrainBatch(events(2, 0, True), None).split(torch.zeros(4, 1))] == [2, 2, 0]

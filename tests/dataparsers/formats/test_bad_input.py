@@ -318,6 +318,21 @@ ESIM = [
         ("simulation.json holds the contrast thresholds 0.2", "and 0 (", "from 0.001 to 10"),
     ),
     BadInput(
+        "exposure longer than from frame to frame",
+        write("simulation.json", json.dumps({"exposure_ns": 10**30})),
+        ("simulation.json holds exposures of 1e+09 ms of frames that are 300 ms apart",),
+    ),
+    BadInput(
+        "exposure no whole number",
+        write("simulation.json", json.dumps({"exposure_ns": 2.5})),
+        ("simulation.json holds exposure_ns = 2.5, but a whole number of nanoseconds was expected",),
+    ),
+    BadInput(
+        "response unknown",
+        write("simulation.json", json.dumps({"response": "log"})),
+        ("simulation.json holds the response 'log', but linlog, or",),
+    ),
+    BadInput(
         "camera without focal length",
         write("simulation.json", json.dumps({"camera": {"width": 24, "height": 18}})),
         ("simulation.json holds camera", "fx, fy"),

@@ -77,15 +77,25 @@ def test_images_of_one_three_or_four_channels(tmp_path: Path, channels: int):
     np.testing.assert_allclose(load_image(frames.filenames[2]), expected, atol=1.0 if channels == 4 else 0.0)
 
 
-def test_simulation_json_states_thresholds_depth_and_camera(tmp_path: Path):
-    folder = write_esim(tmp_path / "esim")
+def test_simulation_json_states_thresholds_response_exposure_depth_and_camera(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim", ("images", "images_corrupted"))
     camera = {"width": WIDTH, "height": HEIGHT, "fx": 21.0, "fy": 22.0, "cx": 11.5, "cy": 8.5}
     about = {"contrast_thresholds": [0.2, 0.3], "depth_range": [1, 2], "camera": camera, "seed": 0}
+    about |= {"response": "logarithm:0.01", "exposure_ns": 5_000_000}
     (folder / "simulation.json").write_text(json.dumps(about))
     recording = read_recording(folder)
     assert recording.contrast_thresholds == (0.2, 0.3)
     assert recording.depth_range == (1.0, 2.0)
     assert recording.camera == Camera(WIDTH, HEIGHT, 21.0, 22.0, 11.5, 8.5)
+    assert recording.response == "logarithm:0.01"
+    assert recording.frames is not None and recording.blurred_frames is not None
+    assert recording.frames.exposures.tolist() == [0] * 3
+    assert recording.blurred_frames.exposures.tolist() == [5_000_000] * 3
+
+
+def test_exposures_are_not_known_without_simulation_json(tmp_path: Path):
+    recording = read_recording(write_esim(tmp_path / "esim", ("images", "images_corrupted")))
+    assert recording.frames.exposures is None and recording.blurred_frames.exposures is None
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (1.0, np.inf), (-1.0, 1.0)])

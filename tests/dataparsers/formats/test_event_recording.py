@@ -217,6 +217,7 @@ def same_recording(found: EventRecording, expected: EventRecording) -> None:
         for one, other in zip(ours.depth_filenames or (), theirs.depth_filenames or (), strict=True):
             np.testing.assert_array_equal(np.load(one), np.load(other))
         assert ours.camera == theirs.camera
+        np.testing.assert_array_equal(ours.exposures, theirs.exposures)
         times = torch.from_numpy(ours.times)
         np.testing.assert_allclose(ours.trajectory.poses(times), theirs.trajectory.poses(times), rtol=0, atol=1e-12)
 
@@ -259,8 +260,11 @@ def test_all_of_this_layout_and_back(tmp_path: Path):
         "depth_range": [0.1, 7],
     }
     folder = write_recording(tmp_path / "own", ("frames", "blurred_frames"), depth=True, **about)
+    (folder / "blurred_frames/exposures_ns.txt").write_text("300000000\n1000\n0\n")
     np.save(folder / "camera_directions.npy", np.random.default_rng(0).normal(0, 0.3, (HEIGHT, WIDTH, 2)))
     recording = read_recording(folder)
+    assert recording.blurred_frames is not None and recording.blurred_frames.exposures is not None
+    assert recording.blurred_frames.exposures.tolist() == [300_000_000, 1000, 0]
     same_recording(copied(recording, tmp_path / "again"), recording)
 
 
@@ -488,6 +492,32 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
         "line 1 holds a quaternion of norm 2",
     ),
     "stamps missing": (remove("frames/stamps_ns.txt"), "stamps_ns.txt is missing"),
+    "an exposure too few": (
+        put("frames/exposures_ns.txt", "5000000\n5000000\n"),
+        "exposures_ns.txt holds 2 exposures of 3 frames, but one of each was expected",
+    ),
+    "exposure negative": (
+        put("frames/exposures_ns.txt", "5000000\n-5000000\n5000000\n"),
+        "exposures_ns.txt holds the exposure -5000000 ns, but 0, or at least 1000 ns,",
+    ),
+    "exposures in milliseconds": (
+        put("frames/exposures_ns.txt", "20\n20\n20\n"),
+        "exposures_ns.txt holds the exposure 20 ns, but 0, or at least 1000 ns,",
+    ),
+    "exposures in seconds": (
+        put("frames/exposures_ns.txt", "0.02\n0.02\n0.02\n"),
+        "exposures_ns.txt holds the exposure 1 ns, but 0, or at least 1000 ns,",
+    ),
+    "exposures longer than from frame to frame": (
+        put("frames/exposures_ns.txt", "5000000\n400000000\n400000000\n"),
+        "exposures_ns.txt holds exposures of 400 ms of frames that are 300 ms apart, but",
+    ),
+    "exposures beyond all times": (put("frames/exposures_ns.txt", "1e300\n0\n0\n"), "but exposures up to the time from"),
+    "exposure no number": (
+        put("frames/exposures_ns.txt", "0\nlong\n0\n"),
+        "exposures_ns.txt, line 2 holds 'long' where a finite number was expected",
+    ),
+    "exposures empty": (put("frames/exposures_ns.txt", ""), "exposures_ns.txt is empty; rows of the columns exposure_ns"),
     "a frame missing": (remove("frames/1.png"), "frames holds 2 images, but its stamps_ns.txt holds 3 stamps"),
     "frame of another size": (
         lambda folder: write_image(folder / "frames/1.png", np.zeros((4, 5, 1), np.uint8)),

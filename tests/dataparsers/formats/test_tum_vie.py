@@ -435,12 +435,20 @@ def test_stamps_and_exposures_may_lie_above_the_images(raw: Path, prepared: Path
     np.testing.assert_array_equal(found, expected)
 
 
+def test_exposures_lie_half_before_and_half_after_the_times_of_frames(raw: Path):
+    frames = frames_of(read(raw))
+    stamps = np.loadtxt(raw / "mocap-desk2-vi_gt_data/left_images/image_timestamps_left.txt").astype(np.int64)
+    begins = (stamps - 5_000_000) * 1000
+    np.testing.assert_array_equal(frames.exposed.T, [begins, begins + np.array(EXPOSURES) * 1000])
+
+
 def test_without_exposures_frames_have_their_stamps(raw: Path):
     images = raw / "mocap-desk2-vi_gt_data/left_images"
     (images / "image_exposures_left.txt").unlink()
     recording = read(raw)
     stamps = np.loadtxt(images / "image_timestamps_left.txt").astype(np.int64)
     np.testing.assert_array_equal(frames_of(recording).times, (stamps - 5_000_000) * 1000)
+    assert frames_of(recording).exposures is None
     assert list(recording.notes) == ["image_exposures_left.txt is missing, so frames have the poses at their stamps."]
 
 

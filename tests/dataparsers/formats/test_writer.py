@@ -244,6 +244,18 @@ def frames_read(written: Written) -> tuple[Frames | None, Frames]:
     return recording.frames, recording.blurred_frames
 
 
+def test_exposures_are_read_back_where_the_layout_states_them(written: Written):
+    sharp, blurred = frames_read(written)
+    if written.layout == "eds":
+        assert blurred.exposures is None
+        return
+    assert blurred.exposures is not None
+    exact = EXPOSURE // 1000 * 1000 if written.layout == "tum_vie" else EXPOSURE
+    assert blurred.exposures.tolist() == [exact] * len(FRAME_TIMES)
+    if sharp:
+        assert sharp.exposures is not None and not sharp.exposures.any()
+
+
 def test_frames_and_depth_are_read_back(written: Written):
     sharp, blurred = frames_read(written)
     for frames in filter(None, (sharp, blurred)):

@@ -1,0 +1,40 @@
+"""How far a picture moves while it is taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from enerf_ns.dataparsers.recording import Frames
+
+STEPS = 8
+"""Parts of each exposure, within which motion is taken to be straight."""
+
+PLACES = 3
+"""Pixels that are followed across the picture, and down it, from border to border."""
+
+
+def exposure_motion(frames: Frames, near: float, far: float) -> Float64[np.ndarray, " frames"]:
+    """How far what the pixels see moves during each exposure: the longest path of any that is followed, pixels.
+
+    Points at both depths before a grid of `PLACES` x `PLACES` pixels in the middle of the exposure are followed through
+    `STEPS` parts of it.
+
+    Args:
+        frames: Exposed within their trajectory.
+        near, far: Range of depth, metres.
+    """
+    camera = frames.camera.undistorted()
+    columns, rows = (np.linspace(0, side - 1, PLACES) for side in (camera.width, camera.height))
+    pixels = np.stack([*np.meshgrid(columns, rows), np.ones((PLACES, PLACES))], axis=-1).reshape(-1, 3)
+    rays = np.concatenate([depth * pixels @ np.linalg.inv(camera.matrix).T for depth in (near, far)])
+
+    opens, closes = frames.exposed.T
+    times = opens[:, None] + (closes - opens)[:, None] * np.arange(STEPS + 1) // STEPS
+    poses = frames.trajectory.poses(torch.from_numpy(times)).numpy()
+    middle = poses[:, STEPS // 2]
+    points = rays @ middle[:, :, :3].transpose(0, 2, 1) + middle[:, None, :, 3]
+    seen = (points[:, None] - poses[:, :, None, :, 3]) @ poses[..., :3] @ camera.matrix.T
+    places = seen[..., :2] / seen[..., 2:].clip(min=1e-3 * near)  # what is passed counts as nearly touched
+    return np.linalg.norm(np.diff(places, axis=1), axis=-1).sum(axis=1).max(axis=1)
