@@ -143,7 +143,9 @@ class EventRecording:
     frames: Frames | None = None
     """Sharp frames."""
     blurred_frames: Frames | None = None
-    """Frames at the same instants as the sharp ones, blurred by motion."""
+    """Frames at the same instants as the sharp ones, blurred by motion, or reconstructed from events."""
+    reconstructed_by: str | None = None
+    """What reconstructed the blurred frames from events; None where a camera took them."""
     held_out_frames: Frames | None = None
     """Views for evaluation alone, on a trajectory and a clock of their own."""
     contrast_thresholds: tuple[float, float] | None = None
@@ -321,6 +323,8 @@ class EventRecording:
                 f"the response {self.response!r}, but linlog, or logarithm:OFFSET with an offset above 0, such as "
                 "logarithm:0.001, was expected."
             )
+        if not isinstance(self.reconstructed_by, str | None):
+            raise ValueError(f"reconstructed_by = {self.reconstructed_by!r}, but a text was expected.")
         near, far = self.depth_range or (1.0, 2.0)
         if not DEPTH_LIMITS[0] <= near < far <= DEPTH_LIMITS[1]:
             raise ValueError(

@@ -16,6 +16,7 @@ from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
+from enerf_ns.dataparsers.recording import EventRecording
 
 
 def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:
@@ -34,9 +35,21 @@ def convert_recording(source: Path, output_dir: Path, **options: object) -> list
         FlagError: The format lacks an option.
         OutputError: The folder holds something, lies in the recording, or cannot be written.
     """
-    with _new_folder(source, output_dir) as folder:
-        recording = read_recording(source, **options)  # type: ignore[arg-type]
-        num_events = event_recording.write(recording, folder)
+    with new_folder(source, output_dir) as folder:
+        return write_recording(read_recording(source, **options), folder)  # type: ignore[arg-type]
+
+
+def write_recording(recording: EventRecording, folder: Path) -> list[str]:
+    """Writes a recording as `event_recording.write` does.
+
+    Args:
+        recording: Of any format.
+        folder: Exists and is empty.
+
+    Returns:
+        What was found, and what is left out, in sentences.
+    """
+    num_events = event_recording.write(recording, folder)
     num_poses = len(recording.trajectory.times)
     num_frames = sum(len(frames.times) for frames in (recording.frames, recording.blurred_frames) if frames)
     sentences = [
@@ -74,7 +87,7 @@ def convert_event_file(
         OutputError: The folder holds something or cannot be written.
     """
     sentences: list[str] = []
-    with _new_folder(source, output_dir) as folder:
+    with new_folder(source, output_dir) as folder:
         file = open_event_file(source)
         about = _camera_json(file, camera)
         rows = read_poses(poses, poses_unit, sentences) if poses is not None else None
@@ -121,7 +134,7 @@ def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
 
 
 @contextmanager
-def _new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
+def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
     """A folder to write into that becomes the output at the end of the block, if nothing fails there."""
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(

@@ -3,12 +3,13 @@
     events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
     poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
     recording.json                   camera; and, optional, frame_camera, contrast_thresholds, refractory_period_ns,
-                                     bayer_pattern, response, depth_range
+                                     bayer_pattern, response, depth_range, reconstructed_by
     camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
                                      (both optional)
-    blurred_frames/*.png             frames blurred by motion, with such tables of their own (optional)
+    blurred_frames/*.png             frames blurred by motion, with such tables of their own (optional); where
+                                     reconstructed_by says what made them of the events, they are of the event camera
     depth/*.npy                      (height, width) depth in metres of each sharp frame, 0 where nothing is (optional)
 
 All times are nanoseconds on one clock, from any zero.
@@ -56,6 +57,7 @@ FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 
 OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
+    "reconstructed_by",
 )
 EXPOSURES_NAME = "exposures_ns.txt"
 STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
@@ -87,6 +89,11 @@ def read(folder: Path) -> EventRecording:
     if "frame_camera" in about:
         frame_camera, mounting = _parse_frame_camera(path, about["frame_camera"])
         frame_trajectory = trajectory.of_mounted(mounting)
+    reconstructed_by = about.get("reconstructed_by")
+    blurred_rig = frame_camera, frame_trajectory
+    if reconstructed_by is not None:
+        blurred_rig = camera, trajectory
+        notes.append(f"The blurred frames are reconstructed from events by {reconstructed_by}.")
     depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
     with of_file(path):
         return EventRecording(
@@ -97,7 +104,8 @@ def read(folder: Path) -> EventRecording:
             stream_events=lambda: _stream_events(folder / "events", columns),
             event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
             frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, depth_files),
-            blurred_frames=_read_frames(folder / "blurred_frames", frame_camera, frame_trajectory),
+            blurred_frames=_read_frames(folder / "blurred_frames", *blurred_rig),
+            reconstructed_by=reconstructed_by,
             contrast_thresholds=_parse_two(
                 path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
             ),
@@ -127,12 +135,13 @@ def write(recording: EventRecording, folder: Path) -> int:
         OSError: The disk is full, or a frame cannot be copied.
     """
     kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
-    frame_cameras = [_frame_camera_json(recording, frames) for frames in kinds.values() if frames is not None]
+    of_frame_camera = kinds.values() if recording.reconstructed_by is None else [recording.frames]
+    frame_cameras = [_frame_camera_json(recording, frames) for frames in of_frame_camera if frames is not None]
     if any(camera != frame_cameras[0] for camera in frame_cameras):
         raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
     sensor = recording.contrast_thresholds, recording.refractory_period, recording.bayer_pattern, recording.response
     frame_camera = frame_cameras[0] if frame_cameras else None
-    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range)
+    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range, recording.reconstructed_by)
     write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
@@ -349,6 +358,7 @@ def _encode_about(
     bayer_pattern: str | None,
     response: str | None,
     depth_range: tuple[float, float] | None,
+    reconstructed_by: str | None = None,
 ) -> bytes:
     """recording.json, in which what is not known is left out."""
     about = {
@@ -359,6 +369,7 @@ def _encode_about(
         "bayer_pattern": bayer_pattern,
         "response": response,
         "depth_range": depth_range,
+        "reconstructed_by": reconstructed_by,
     }
     return encode_json({key: value for key, value in about.items() if value is not None})
 

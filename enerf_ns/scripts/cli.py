@@ -13,6 +13,7 @@ from enerf_ns.scripts.check_numerics import CheckNumerics
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.demo import Demo
 from enerf_ns.scripts.inspect import Inspect
+from enerf_ns.scripts.reconstruct import Reconstruct
 from enerf_ns.scripts.report import Report
 from enerf_ns.scripts.simulate import Simulate
 
@@ -21,6 +22,7 @@ Command = Union[  # noqa: UP007
     Annotated[Convert, tyro.conf.subcommand(name="convert")],
     Annotated[Demo, tyro.conf.subcommand(name="demo")],
     Annotated[Inspect, tyro.conf.subcommand(name="inspect")],
+    Annotated[Reconstruct, tyro.conf.subcommand(name="reconstruct")],
     Annotated[Report, tyro.conf.subcommand(name="report")],
     Annotated[Simulate, tyro.conf.subcommand(name="simulate")],
 ]

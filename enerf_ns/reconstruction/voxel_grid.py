@@ -1,0 +1,40 @@
+"""Events of a window of time as a voxel grid, the input of networks that reconstruct frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from enerf_ns.dataparsers.recording import Events
+
+
+def voxel_grid(events: Events, num_bins: int, width: int, height: int) -> Float32[Tensor, "num_bins height width"]:
+    """Polarities summed by pixel and time, each event shared linearly by the two bins beside it (Zhu et al., CVPR 2019).
+
+    Args:
+        events: In time order; the first lies in the middle of bin 0 and the last in that of the last bin.
+        num_bins: At least 2.
+        width, height: Of the sensor, pixels.
+    """
+    since_first = (events.t - events.t[:1]).astype(np.float64)
+    places = since_first * ((num_bins - 1) / since_first.max(initial=1.0))
+    bins = np.minimum(places.astype(np.int64), num_bins - 2)
+    later = (places - bins) * np.where(events.p > 0, 1.0, -1.0)
+    earlier = np.where(events.p > 0, 1.0, -1.0) - later
+    voxels = (bins * height + events.y) * width + events.x
+    size = num_bins * height * width
+    grid = np.bincount(voxels, earlier, size) + np.bincount(voxels + height * width, later, size)
+    return torch.from_numpy(grid.reshape(num_bins, height, width)).float()
+
+
+def normalised(grid: Float32[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
+    """The grid with mean 0 and standard deviation 1 of its voxels that are not 0; those that are stay so.
+
+    Where all of these are equal, they stay as they are.
+    """
+    filled = grid != 0
+    values = grid[filled]
+    deviation = values.std(correction=0) if len(values) else 0.0
+    return torch.where(filled, (grid - values.mean()) / deviation, 0.0) if deviation > 0 else grid
