@@ -35,11 +35,18 @@ def nearest_poses(
         depths: Of what the held-out views see, metres.
     """
     distances = np.linalg.norm(held_out[:, None, :, 3] - training[None, :, :, 3], axis=-1)
-    # the norm of the difference of two rotations by an angle a apart is sqrt(8) sin(a / 2), precise also where a is 0
-    apart = np.linalg.norm(held_out[:, None, :, :3] - training[None, :, :, :3], axis=(-2, -1))
-    angles = 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0))
+    angles = rotation_angles(held_out[:, None, :, :3], training[None, :, :, :3])
     nearest = np.argmin(distances / depths[:, None] + angles, axis=1)[:, None]
     return np.take_along_axis(distances, nearest, 1)[:, 0], np.take_along_axis(angles, nearest, 1)[:, 0]
+
+
+def rotation_angles(
+    first: Float64[np.ndarray, "*batch 3 3"], second: Float64[np.ndarray, "*batch 3 3"]
+) -> Float64[np.ndarray, "*batch"]:
+    """Angle (radians) between two rotations, precise also where it is small: their difference has the norm
+    sqrt(8) sin(angle / 2)."""
+    apart = np.linalg.norm(first - second, axis=(-2, -1))
+    return 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0))
 
 
 def on_path(
