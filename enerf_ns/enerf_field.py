@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 
 from enerf_ns.encodings.hash_grid import HashGrid
-from enerf_ns.precision import full_precision
+from enerf_ns.precision import full_precision, widened
 
 Brightness = Literal["log-sigmoid", "sigmoid", "exponential"]
 """What makes brightness of the colour network's output."""
@@ -120,11 +120,11 @@ class HashDensity(nn.Module):
         """Density in 1 / scene unit, and the features."""
         if self.contraction is not None:
             output = self.network(self.grid(0.5 + 0.25 * self.contraction(positions)))
-            return self.init_density * limited_exp(output[..., :1].float()), output[..., 1:]
+            return self.init_density * limited_exp(widened(output[..., :1])), output[..., 1:]
         unit = SceneBox.get_normalized_positions(positions, self.aabb)
         inside = ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
         output = self.network(self.grid(unit.clamp(0.0, 1.0)))
-        density = self.init_density * limited_exp(output[..., :1].float()) * inside
+        density = self.init_density * limited_exp(widened(output[..., :1])) * inside
         return density, output[..., 1:]
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:

@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from enerf_ns.enerf_field import EnerfField, HashDensity
-from enerf_ns.evaluation.metrics import align_brightness, align_channels, fit_fault, image_metrics
+from enerf_ns.evaluation.metrics import psnr, ssim
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
@@ -299,14 +300,10 @@ class EnerfModel(Model):
         recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
         scores: dict[str, float] = {}
         if batch["is_frame"] and rendered.isfinite().all():
-            if self.sensor.colour_filter:
-                (aligned,), fits = align_channels([rendered], [recorded])
-            else:
-                (aligned,), fit = align_brightness([rendered], [recorded])
-                fits = [fit]
-            if fit_fault(fits) is None:
-                rendered = aligned
-                found = image_metrics(rendered, recorded)
+            aligned = align([rendered], [recorded], DEFAULT_PROTOCOL, self.sensor.colour_filter is not None)
+            if aligned.faults == [None]:
+                rendered = aligned.rendered[0].clamp(0.0, 1.0)
+                found = {"psnr": psnr(rendered, recorded), "ssim": ssim(rendered, recorded)}
                 scores = {name: score for name, score in found.items() if not isinstance(score, str)}
         depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
         images = {

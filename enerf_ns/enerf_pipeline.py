@@ -18,8 +18,9 @@ from enerf_ns.dataparsers.errors import exit_with_a_sentence
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import Score, correlation
+from enerf_ns.evaluation.protocols import described
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import held_out_views, save_pictures
+from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ffmpeg import make_ffmpeg_available
 from enerf_ns.stopwatch import Stopwatch
@@ -134,10 +135,10 @@ class EnerfPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """The `summary_scores` that have a value; what has none is printed, with the reason.
+        """The `summary_scores` that have a value; what has none is printed, with the reason, and so is the protocol.
 
         Args:
-            step: Ignored; Nerfstudio passes it.
+            step: Given while training, when Nerfstudio logs what is returned: the name of the protocol is left out.
             output_path: Folder for one picture a frame, recorded beside rendered.
             get_std: Give the standard deviation over the frames too.
 
@@ -147,8 +148,10 @@ class EnerfPipeline(VanillaPipeline):
         views, summary = held_out_views(self)
         if output_path is not None:
             with exit_with_a_sentence():
-                save_pictures(views, output_path)
+                save_pictures(aligned_views(views)[0], output_path)
         scores = summary_scores(views, summary, get_std)
+        protocol = str(scores["protocol"] if step is None else scores.pop("protocol"))
+        CONSOLE.print(described(protocol), soft_wrap=True, highlight=False, markup=False)
         not_scored: Any = scores.pop("not_scored", {})
         for name, reasons in not_scored.items():
             for reason, numbers in reasons.items():

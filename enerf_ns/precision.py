@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,11 +27,12 @@ def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments,
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
             return function(
-                *[_widened(value) for value in args], **{name: _widened(value) for name, value in kwargs.items()}
+                *[widened(value) for value in args], **{name: widened(value) for name, value in kwargs.items()}
             )  # type: ignore[arg-type]
 
     return run
 
 
-def _widened(value: object) -> object:
+def widened(value: Any) -> Any:
+    """Float32 of a tensor in half precision; anything else as it is."""
     return value.float() if isinstance(value, Tensor) and value.dtype in HALF else value

@@ -23,8 +23,8 @@ from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_pipeline import EnerfPipelineConfig
-from enerf_ns.evaluation.metrics import align_channels
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
+from enerf_ns.evaluation.views import aligned_views, held_out_views
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.sensor.response import inverse_linlog, linlog
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
@@ -202,10 +202,11 @@ def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(rec
         optimizer.step()
     assert pipeline.event_correlation(2048) > 0.85
 
-    views, summary = held_out_views(pipeline)
+    views, _ = held_out_views(pipeline)
+    shown, summary = aligned_views(views)
     rendered, recorded, aligned = (
-        torch.stack([getattr(view, name) for view in views]).double().reshape(-1, 3)
-        for name in ("unaligned", "recorded", "rendered")
+        torch.stack([getattr(view, name) for view in of]).double().reshape(-1, 3)
+        for of, name in ((views, "rendered"), (views, "recorded"), (shown, "rendered"))
     )
     correlations = np.corrcoef(linlog(rendered).T, linlog(recorded).T)[:3, 3:]
     assert (correlations.diagonal() > 0.75).all()
@@ -215,17 +216,17 @@ def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(rec
         scale, offset = np.polyfit(x, y, 1)
         assert summary[f"brightness_scale_{name}"] == pytest.approx(scale, rel=1e-6)
         assert summary[f"brightness_offset_{name}"] == pytest.approx(offset, rel=1e-6)
-        expected = inverse_linlog(scale * x + offset).clamp(0, 1)
+        expected = inverse_linlog(scale * x + offset)
         torch.testing.assert_close(aligned[:, channel], expected, rtol=0, atol=1e-6)
     assert not {"brightness_scale", "brightness_offset"} & set(summary)
 
     recorded: Any = views[0].recorded
-    rendered = views[0].unaligned
+    rendered = views[0].rendered
     _, images = pipeline.model.get_image_metrics_and_images(
         {"rgb": rendered, "depth": views[0].depth}, {"image": recorded, "is_frame": True}
     )
-    shown = align_channels([rendered], [recorded])[0][0]
-    torch.testing.assert_close(images["img"], torch.cat([recorded, shown], dim=1))
+    alone = align([rendered], [recorded], DEFAULT_PROTOCOL, colour_filter=True).rendered[0].clamp(0, 1)
+    torch.testing.assert_close(images["img"], torch.cat([recorded, alone], dim=1))
 
 
 def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
@@ -233,8 +234,9 @@ def test_a_grey_sensor_gets_one_fit_and_no_channels(recording: EventRecording):
     pipeline = make_pipeline(grey)
     assert pipeline.model.config.num_channels == 1
     assert pipeline.model.sensor.colour_filter is None
-    _, summary = held_out_views(pipeline)
-    assert {"brightness_scale", "brightness_offset"} <= set(summary)
+    views: Any = held_out_views(pipeline)[0]
+    _, parameters = aligned_views([replace(view, rendered=0.5 * view.recorded) for view in views])
+    assert set(parameters) == {"brightness_scale", "brightness_offset"}
 
 
 @pytest.mark.parametrize("supervision", ["events", "events+frames"])

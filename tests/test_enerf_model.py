@@ -170,7 +170,7 @@ def test_brightness_above_white_is_scored_as_it_is_and_shown_as_white(recording:
     pipeline.eval()
     camera = pipeline.datamanager.eval_dataset.cameras[:1]
     shown = pipeline.model.get_outputs_for_camera(camera)["rgb"]
-    scored = held_out_views(pipeline)[0][0].unaligned
+    scored = held_out_views(pipeline)[0][0].rendered
     assert scored.isfinite().all() and (scored > 1).any()
     torch.testing.assert_close(shown, scored.clamp(max=1.0))
 

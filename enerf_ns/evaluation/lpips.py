@@ -1,15 +1,16 @@
-"""LPIPS with AlexNet (Zhang et al., CVPR 2018), whose weights are loaded when first needed."""
+"""LPIPS with AlexNet or VGG (Zhang et al., CVPR 2018), whose weights are loaded when first needed."""
 
 from __future__ import annotations
 
 import functools
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from jaxtyping import Float
@@ -20,41 +21,58 @@ from enerf_ns.evaluation.metrics import NOT_FINITE, Score
 if TYPE_CHECKING:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-WEIGHTS_VARIABLE = "ENERF_LPIPS_WEIGHTS"
-"""Environment variable that names a file with the state dict of torchvision's `alexnet().features` (ImageNet)."""
-
-SMALLEST_SIDE = 31
-"""Pixels along a side of the smallest picture of which AlexNet's poolings leave anything."""
+Net = Literal["alex", "vgg"]
+"""Networks whose features are compared: AlexNet, or VGG-16."""
 
 
-@functools.lru_cache(maxsize=1)
-def load_lpips() -> LearnedPerceptualImagePatchSimilarity | None:
+@dataclass(frozen=True)
+class Network:
+    """What is known of a network."""
+
+    model: str
+    """Name of torchvision's function that makes it."""
+    weights_variable: str
+    """Environment variable that names a file with the state dict of the model's features (ImageNet)."""
+    smallest_side: int
+    """Pixels along a side of the smallest picture of which its poolings leave anything."""
+    score: str
+    """Name of the score."""
+
+
+NETWORKS: dict[Net, Network] = {
+    "alex": Network("alexnet", "ENERF_LPIPS_WEIGHTS", 31, "lpips"),
+    "vgg": Network("vgg16", "ENERF_LPIPS_VGG_WEIGHTS", 16, "lpips_vgg"),
+}
+"""By the names that LPIPS has for them."""
+
+
+@functools.cache
+def load_lpips(net: Net) -> LearnedPerceptualImagePatchSimilarity | None:
     """The metric, or None with a line that says why, where its weights are neither at hand nor to be downloaded."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    path = os.environ.get(WEIGHTS_VARIABLE)
+    network = NETWORKS[net]
+    path = os.environ.get(network.weights_variable)
     try:
-        if path is None:
-            return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
-        with _alexnet_at_hand(Path(path)):
-            return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
+        with _at_hand(network, Path(path)) if path is not None else nullcontext():
+            return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True)
     except (OSError, EOFError, KeyError, TypeError, RuntimeError, UnpicklingError) as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         print(
-            f"LPIPS is left out: the AlexNet weights could not be loaded ({reason}); "
-            f"set {WEIGHTS_VARIABLE} to a file with the state dict of torchvision's alexnet().features."
+            f"{network.score} is left out: the weights of {network.model} could not be loaded ({reason}); set "
+            f"{network.weights_variable} to a file with the state dict of torchvision's {network.model}().features."
         )
         return None
 
 
 @contextmanager
-def _alexnet_at_hand(features: Path) -> Iterator[None]:
-    """Lets torchvision find AlexNet in its folder of downloads: these features, with a classifier of zeros, unused."""
-    from torchvision.models import AlexNet_Weights, alexnet
+def _at_hand(network: Network, features: Path) -> Iterator[None]:
+    """Lets torchvision find a network in its folder of downloads: these features; its classifier, unused, is zeros."""
+    from torchvision.models import get_model, get_model_weights
 
     weights = torch.load(features, map_location="cpu", weights_only=True)
     with torch.device("meta"):
-        layers = alexnet(weights=None).state_dict()
+        layers = get_model(network.model, weights=None).state_dict()
     state = {
         name: weights[name.removeprefix("features.")]
         if name.startswith("features.")
@@ -63,7 +81,7 @@ def _alexnet_at_hand(features: Path) -> Iterator[None]:
     }
     hub = torch.hub.get_dir()
     with TemporaryDirectory() as folder:
-        file = Path(folder, "checkpoints", Path(AlexNet_Weights.DEFAULT.url).name)
+        file = Path(folder, "checkpoints", Path(get_model_weights(network.model).DEFAULT.url).name)
         file.parent.mkdir()
         torch.save(state, file)
         torch.hub.set_dir(folder)
@@ -73,13 +91,16 @@ def _alexnet_at_hand(features: Path) -> Iterator[None]:
             torch.hub.set_dir(hub)
 
 
-def lpips(rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"]) -> Score:
+def lpips(
+    rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"], net: Net = "alex"
+) -> Score:
     """Perceptual distance of two pictures in [0, 1]."""
     if not rendered.isfinite().all():
         return NOT_FINITE
-    if min(rendered.shape[:2]) < SMALLEST_SIDE:
-        return f"the frame is smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE} pixels"
-    metric = load_lpips()
+    side = NETWORKS[net].smallest_side
+    if min(rendered.shape[:2]) < side:
+        return f"the frame is smaller than {side} x {side} pixels"
+    metric = load_lpips(net)
     if metric is None:
         return "its weights could not be loaded"
     pictures = [image.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for image in (rendered, recorded)]

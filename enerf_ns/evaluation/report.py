@@ -24,7 +24,7 @@ from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import NotScored, summary_scores
-from enerf_ns.evaluation.views import HeldOutView, held_out_views
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_views
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +39,7 @@ VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 
 def write_report(
     run: Run, output_dir: Path, extra: Mapping[str, float] | None = None
-) -> dict[str, float | NotScored | None]:
+) -> dict[str, float | str | NotScored | None]:
     """Render the held-out frames once and write scores.json and side-by-side.png; then camera_path.json and video.mp4.
 
     Args:
@@ -59,7 +59,7 @@ def write_report(
     views, summary = held_out_views(run.pipeline)
     scores = summary_scores(views, summary) | dict(extra or {})
     picture = io.BytesIO()
-    side_by_side(views, dataset.recording).savefig(picture, format="png")
+    side_by_side(aligned_views(views)[0], dataset.recording).savefig(picture, format="png")
     with _writing_to(output_dir):
         write_whole(output_dir / "side-by-side.png", picture.getvalue())
         write_whole(output_dir / "scores.json", json.dumps(scores, indent=2) + "\n")
@@ -82,7 +82,7 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
     """Frame, render, depth and events of a few held-out frames, side by side.
 
     Args:
-        views: All that there are, at least one.
+        views: All that there are, at least one, as `aligned_views` gives them.
         recording: Of which the events are. Of held-out frames on a clock of their own, events are not shown.
     """
     from matplotlib.figure import Figure

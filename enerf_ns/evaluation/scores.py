@@ -6,45 +6,83 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from enerf_ns.evaluation.lpips import lpips
-from enerf_ns.evaluation.metrics import Score, correlation, depth_rmse, image_metrics, is_known
-from enerf_ns.evaluation.views import HeldOutView
+from enerf_ns.evaluation.lpips import NETWORKS, Net, lpips
+from enerf_ns.evaluation.metrics import Score, correlation, depth_rmse, is_known, psnr, ssim
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS
+from enerf_ns.evaluation.views import HeldOutView, aligned_views
 
 NotScored = dict[str, dict[str, list[int]]]
 """What has no value: by score and reason, the numbers of the held-out frames, from 0; none of a score of the whole
 set."""
 
 
-def view_scores(view: HeldOutView) -> dict[str, Score]:
+def view_scores(
+    view: HeldOutView, aligned: HeldOutView, protocol: str = DEFAULT_PROTOCOL, lpips_nets: Sequence[Net] = ("alex",)
+) -> dict[str, Score]:
     """Scores of one held-out frame, each a number or why there is none.
 
+    Args:
+        view: As it was rendered.
+        aligned: The same among `aligned_views`.
+        protocol: Which of `PROTOCOLS` aligned it.
+        lpips_nets: Networks whose LPIPS is computed.
+
     Returns:
-        psnr (dB), ssim, correlation, lpips, and of a recording with depth depth_rmse (metres). The correlation is that
-        of the render as it is, before brightness is aligned.
+        psnr (dB), ssim, correlation, lpips (AlexNet) and lpips_vgg, those that are asked for, and of a recording with
+        depth depth_rmse (metres). The correlation is that of the render as it is, before brightness is aligned.
     """
-    if view.recorded is None:
-        return dict.fromkeys(("psnr", "ssim", "correlation", "lpips"), "there is no frame")
-    scores = image_metrics(view.rendered, view.recorded)
-    scores["correlation"] = correlation(view.unaligned, view.recorded)
-    scores["lpips"] = lpips(view.rendered, view.recorded)
-    if view.not_aligned is not None:
-        scores |= dict.fromkeys(("psnr", "ssim", "lpips"), view.not_aligned)
+    names = ["psnr", "ssim", *(NETWORKS[net].score for net in lpips_nets)]
+    if view.recorded is None or aligned.recorded is None:
+        return dict.fromkeys((*names, "correlation"), "there is no frame")
+    scores: dict[str, Score] = {}
+    if aligned.not_aligned is not None:
+        scores |= dict.fromkeys(names, aligned.not_aligned)
+    else:
+        clipped = aligned.rendered.clamp(0.0, 1.0) if aligned.rendered.isfinite().all() else aligned.rendered
+        scores["psnr"] = psnr(clipped if PROTOCOLS[protocol].clips else aligned.rendered, aligned.recorded)
+        scores["ssim"] = ssim(clipped, aligned.recorded)
+        for net in lpips_nets:
+            scores[NETWORKS[net].score] = lpips(clipped, aligned.recorded, net)
+    scores["correlation"] = correlation(view.rendered, view.recorded)
     if view.recorded_depth is not None:
         scores["depth_rmse"] = depth_rmse(view.depth, view.recorded_depth)
     return scores
 
 
-def mean_scores(views: Sequence[HeldOutView], with_std: bool = False) -> tuple[dict[str, float], NotScored]:
+def mean_scores(
+    views: Sequence[HeldOutView],
+    with_std: bool = False,
+    protocol: str = DEFAULT_PROTOCOL,
+    lpips_nets: Sequence[Net] = ("alex",),
+    crop: tuple[int, int] | None = None,
+) -> tuple[dict[str, float], NotScored]:
     """Mean of each of the `view_scores` over the held-out frames that have it; no entry where none has.
 
     Args:
-        views: At least one, of one recording.
+        views: At least one, of one recording, as `held_out_views` gives them.
         with_std: Give the standard deviation over these frames too, as NAME_std.
+        protocol: Which of `PROTOCOLS` aligns brightness, and says how PSNR is computed.
+        lpips_nets: Networks whose LPIPS is computed.
+        crop: Height and width of the middle of each frame that alone is fitted and scored; None: all.
 
     Returns:
         The means, and which frames they leave out, and why.
+
+    Raises:
+        FlagError: The crop is larger than the frames.
     """
-    per_view = [view_scores(view) for view in views]
+    views = [view.cropped(*crop) for view in views] if crop else views
+    return _mean_scores(views, aligned_views(views, protocol)[0], with_std, protocol, lpips_nets)
+
+
+def _mean_scores(
+    views: Sequence[HeldOutView],
+    aligned: Sequence[HeldOutView],
+    with_std: bool,
+    protocol: str,
+    lpips_nets: Sequence[Net],
+) -> tuple[dict[str, float], NotScored]:
+    per_view = [view_scores(*both, protocol, lpips_nets) for both in zip(views, aligned, strict=True)]
     means: dict[str, float] = {}
     not_scored: NotScored = {}
     for name in per_view[0]:
@@ -57,27 +95,43 @@ def mean_scores(views: Sequence[HeldOutView], with_std: bool = False) -> tuple[d
             means[name] = float(np.mean(values))
             if with_std:
                 means[f"{name}_std"] = float(np.std(values))
+    if PROTOCOLS[protocol].pooled and "psnr" in means:
+        errors = [10.0 ** (-0.1 * scores["psnr"]) for scores in per_view if not isinstance(scores["psnr"], str)]
+        means["psnr"] = float(-10.0 * np.log10(np.mean(errors)))
     return means, not_scored
 
 
 def summary_scores(
-    views: Sequence[HeldOutView], summary: Mapping[str, Score], with_std: bool = False
-) -> dict[str, float | NotScored | None]:
+    views: Sequence[HeldOutView],
+    summary: Mapping[str, Score],
+    with_std: bool = False,
+    protocol: str = DEFAULT_PROTOCOL,
+    lpips_nets: Sequence[Net] = ("alex",),
+    crop: tuple[int, int] | None = None,
+) -> dict[str, float | str | NotScored | None]:
     """Mean scores and the numbers about the whole set in one table, with a place for each score that can be missing.
 
     Args:
         views: At least one, as `held_out_views` gives them.
         summary: Numbers about the whole set, as `held_out_views` gives them.
-        with_std: As of `mean_scores`.
+        with_std, protocol, lpips_nets, crop: As of `mean_scores`.
 
     Returns:
-        psnr (dB), ssim, lpips, correlation, and with known depth depth_rmse and mean_depth (metres); means over the
-        held-out frames that have them. The first three are None where no frame has them; without frames,
-        event_correlation stands for them. not_scored, where anything is left out, says what and why.
+        protocol, the name; psnr (dB), ssim, lpips, correlation, and with known depth depth_rmse and mean_depth
+        (metres); means over the held-out frames that have them; the parameters of the protocol's fit over the whole
+        set. psnr, ssim and what was asked of LPIPS are None where no frame has them; without frames, event_correlation
+        stands for them, and the protocol is "events". not_scored, where anything is left out, says what and why.
+
+    Raises:
+        FlagError: The crop is larger than the frames.
     """
-    means, not_scored = mean_scores(views, with_std)
-    scores: dict[str, float | NotScored | None] = {"psnr": None, "ssim": None, "lpips": None}
-    scores |= means
+    views = [view.cropped(*crop) for view in views] if crop else views
+    aligned, parameters = aligned_views(views, protocol)
+    means, not_scored = _mean_scores(views, aligned, with_std, protocol, lpips_nets)
+    has_frames = any(view.recorded is not None for view in views)
+    scores: dict[str, float | str | NotScored | None] = {"protocol": protocol if has_frames else EVENTS_PROTOCOL}
+    scores |= dict.fromkeys(("psnr", "ssim", *(NETWORKS[net].score for net in lpips_nets)))
+    scores |= {**means, **parameters}
     depths = [view.recorded_depth[is_known(view.recorded_depth)] for view in views if view.recorded_depth is not None]
     means_of_depth = [float(depth.mean()) for depth in depths if len(depth)]
     if means_of_depth:

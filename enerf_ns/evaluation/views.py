@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,11 +17,13 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from enerf_ns.dataparsers.errors import OutputError
+from enerf_ns.dataparsers.errors import FlagError, OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_datamanager import EnerfDataManager
 from enerf_ns.enerf_model import EnerfModel
-from enerf_ns.evaluation.metrics import Score, align_brightness, align_channels, fit_fault, is_known
+from enerf_ns.evaluation.held_out_poses import held_out_numbers
+from enerf_ns.evaluation.metrics import Score, is_known
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 
 
 class RenderingPipeline(Protocol):
@@ -49,17 +51,47 @@ class HeldOutView:
     recorded: Tensor | None
     """Frame in [0, 1], three channels; None where the recording has no frames."""
     rendered: Tensor
-    """Render in [0, 1], three channels, its brightness aligned where absolute brightness is not observable."""
-    unaligned: Tensor
-    """Render before its brightness was aligned."""
+    """Render as the field has it: linear brightness, 0 or more, three channels."""
     depth: Tensor
     """Rendered depth in metres along the optical axis, one channel."""
     recorded_depth: Tensor | None
     """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
     time: int
     """Instant of the view, ns."""
+    colour_filter: bool = False
+    """Whether the sensor has a colour filter, so that events leave the brightness of each channel open by itself."""
     not_aligned: str | None = None
-    """Why the brightness of the render, which should be aligned, is not; None where it is, or need not be."""
+    """Of `aligned_views`, why the brightness of the render, which should be aligned, is not; None where it is."""
+
+    def cropped(self, height: int, width: int) -> HeldOutView:
+        """The middle of the view.
+
+        Raises:
+            FlagError: It is larger than the view.
+        """
+        whole = self.rendered.shape[:2]
+        if not (0 < height <= whole[0] and 0 < width <= whole[1]):
+            raise FlagError(
+                f"A crop of {height} x {width} pixels (height, width) does not lie in held-out frames of {whole[0]} x "
+                f"{whole[1]}; give a smaller one."
+            )
+        top, left = (whole[0] - height) // 2, (whole[1] - width) // 2
+
+        def cut(picture: Tensor | None) -> Any:
+            return picture if picture is None else picture[top : top + height, left : left + width]
+
+        pictures = {name: cut(getattr(self, name)) for name in ("recorded", "rendered", "depth", "recorded_depth")}
+        return replace(self, **pictures)
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth in metres, of what is known of the recorded one, else of what is finite of the rendered one;
+        1 where there is neither."""
+        for depth in (self.recorded_depth, self.depth):
+            known = None if depth is None else depth[is_known(depth)]
+            if known is not None and len(known):
+                return float(known.median())
+        return 1.0
 
 
 @torch.no_grad()
@@ -89,10 +121,10 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
     return HeldOutView(
         recorded=_reduced(data["image"][..., :3], reduced_by) if dataset.are_frames else None,
         rendered=outputs["rgb"].cpu(),
-        unaligned=outputs["rgb"].cpu(),
         depth=z_depth.cpu(),
         recorded_depth=depth,
         time=int(dataset.frames.times[number]),
+        colour_filter=pipeline.model.sensor.colour_filter is not None,
     )
 
 
@@ -105,7 +137,7 @@ def _reduced(picture: Tensor, by: int) -> Tensor:
 def held_out_views(
     pipeline: RenderingPipeline, numbers: Sequence[int] | None = None, reduced_by: int = 1
 ) -> tuple[list[HeldOutView], dict[str, Score]]:
-    """Render held-out frames; align brightness over all of them where the field learnt from events alone.
+    """Render held-out frames.
 
     Args:
         pipeline: With a trained field.
@@ -113,9 +145,8 @@ def held_out_views(
         reduced_by: As of `held_out_view`.
 
     Returns:
-        The views, and numbers about the whole set: rendering speed; scale and offset of the brightness fit, of
-        each channel where the sensor has a colour filter; for a recording without frames, the correlation of its
-        events, or why there is none.
+        The views, and numbers about the whole set: rendering speed, and the `held_out_numbers`; for a recording without
+        frames, the correlation of its events, or why there is none.
     """
     pipeline.eval()
     manager = pipeline.datamanager
@@ -131,41 +162,40 @@ def held_out_views(
     }
     if not dataset.are_frames:
         summary["event_correlation"] = pipeline.event_correlation()
-    elif manager.config.supervision == "events":
-        summary |= _align(views, each_channel=pipeline.model.sensor.colour_filter is not None)
+    else:
+        depths = np.array([view.median_depth for view in views])
+        summary |= held_out_numbers(manager, np.array(chosen), depths)
     pipeline.train()
     return views, summary
 
 
-def _align(views: Sequence[HeldOutView], each_channel: bool) -> dict[str, float]:
-    """Fits the brightness of all finite renders at once, in place, and returns scale and offset."""
-    finite = [view for view in views if view.rendered.isfinite().all()]
-    if not finite:
-        return {}
-    recorded = [view.recorded for view in finite if view.recorded is not None]
-    rendered = [view.rendered for view in finite]
-    if each_channel:
-        aligned, channel_fits = align_channels(rendered, recorded)
-        fits = dict(zip(("_red", "_green", "_blue"), channel_fits, strict=True))
-    else:
-        aligned, fit = align_brightness(rendered, recorded)
-        fits = {"": fit}
-    fault = fit_fault(list(fits.values()))
-    for view, image in zip(finite, aligned, strict=True):
-        view.not_aligned = fault
-        if fault is None:
-            view.rendered = image
-    summary = {}
-    for name, (scale, offset) in fits.items():
-        summary |= {f"brightness_scale{name}": scale, f"brightness_offset{name}": offset}
-    return summary
+def aligned_views(
+    views: Sequence[HeldOutView], protocol: str = DEFAULT_PROTOCOL
+) -> tuple[list[HeldOutView], dict[str, float]]:
+    """The views as a protocol compares them, to be shown; those without frames as they are.
+
+    Args:
+        views: As `held_out_views` gives them.
+        protocol: Name of one of `PROTOCOLS`.
+
+    Returns:
+        The views, whose renders are not clipped, and the parameters of the one fit over all of them, by name.
+    """
+    framed = [view for view in views if view.recorded is not None]
+    if not framed:
+        return list(views), {}
+    recorded = [view.recorded for view in framed if view.recorded is not None]
+    pictures = align([view.rendered for view in framed], recorded, protocol, framed[0].colour_filter)
+    columns = zip(framed, pictures.rendered, pictures.recorded, pictures.faults, strict=True)
+    aligned = iter([replace(view, rendered=a, recorded=b, not_aligned=fault) for view, a, b, fault in columns])
+    return [view if view.recorded is None else next(aligned) for view in views], pictures.parameters
 
 
 def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
     """Write one picture a view, eval_img_0000.png and so on: the frame, where there is one, beside the render.
 
     Args:
-        views: In the order of their numbers.
+        views: In the order of their numbers, as `aligned_views` gives them.
         folder: Made if it does not exist.
 
     Raises:

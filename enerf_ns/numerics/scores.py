@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from enerf_ns.evaluation.metrics import align_brightness, fit_fault
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 from enerf_ns.evaluation.scores import mean_scores
 from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.numerics.case import case
@@ -23,7 +23,7 @@ def _picture(height: int = 32, width: int = 40) -> Tensor:
 
 def _view(recorded: Tensor, rendered: Tensor, recorded_depth: Tensor | None = None) -> HeldOutView:
     depth = torch.full((*recorded.shape[:2], 1), 2.0)
-    return HeldOutView(recorded, rendered, rendered, depth, recorded_depth, 0)
+    return HeldOutView(recorded, rendered, depth, recorded_depth, 0)
 
 
 def _scored(views: list[HeldOutView]) -> tuple[dict[str, float], dict[str, Any]]:
@@ -34,16 +34,15 @@ def _scored(views: list[HeldOutView]) -> tuple[dict[str, float], dict[str, Any]]
 @case("a render that is the negative of its frame", "no fit, and the reason", 0, "things amiss")
 def negative() -> float:
     recorded = _picture()
-    _, fit = align_brightness([1.0 - recorded], [recorded])
-    return int("negative" not in (fit_fault([fit]) or ""))
+    (fault,) = align([1.0 - recorded], [recorded], DEFAULT_PROTOCOL).faults
+    return int("negative" not in (fault or ""))
 
 
 @case("a render that is flat", "no fit and no correlation, and the reasons", 0, "things amiss")
 def flat() -> float:
     recorded, rendered = _picture(), torch.full((32, 40, 3), 0.4)
-    _, fit = align_brightness([rendered], [recorded])
     means, reasons = _scored([_view(recorded, rendered)])
-    return int(fit_fault([fit]) is None) + int("correlation" in means) + int("correlation" not in reasons)
+    return sum(int(name in means) + int(name not in reasons) for name in ("psnr", "correlation"))
 
 
 @case("a brightness fit of 0.02 to 50 times the contrast", "the scale that was applied, as a share", 1e-4)
@@ -52,7 +51,7 @@ def fitted() -> float:
     errors = []
     for scale in (0.02, 1.0, 50.0):
         rendered = inverse_linlog((linlog(recorded.double()) - 4.0) / scale + 4.0)
-        _, (found, _) = align_brightness([rendered], [recorded.double()])
+        found = align([rendered], [recorded.double()], DEFAULT_PROTOCOL).parameters["brightness_scale"]
         errors.append(abs(found / scale - 1.0))
     return max(errors)
 

@@ -14,7 +14,8 @@ from enerf_ns.simulator.settings import SimulationSettings
 @pytest.fixture(autouse=True)
 def no_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No test downloads weights."""
-    monkeypatch.setenv("ENERF_LPIPS_WEIGHTS", str(tmp_path / "no-weights"))
+    for variable in ("ENERF_LPIPS_WEIGHTS", "ENERF_LPIPS_VGG_WEIGHTS"):
+        monkeypatch.setenv(variable, str(tmp_path / "no-weights"))
 
 
 @pytest.fixture(scope="session")

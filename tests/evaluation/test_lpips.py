@@ -5,9 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 import torchmetrics
+import torchvision
 from torch.nn.functional import conv2d, max_pool2d, relu
+from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-from enerf_ns.evaluation.lpips import SMALLEST_SIDE, WEIGHTS_VARIABLE, load_lpips, lpips
+from enerf_ns.evaluation.lpips import NETWORKS, Net, load_lpips, lpips
+
+WEIGHTS_VARIABLE, SMALLEST_SIDE = NETWORKS["alex"].weights_variable, NETWORKS["alex"].smallest_side
 
 
 @pytest.fixture(autouse=True)
@@ -98,20 +102,59 @@ def test_pictures_have_a_distance_from_the_size_on_that_alexnet_takes(weights):
     for smaller in (small[:-1], small[:, :-1]):
         assert lpips(smaller, smaller) == "the frame is smaller than 31 x 31 pixels"
         with pytest.raises(RuntimeError, match="too small"):
-            load_lpips()(*[smaller.movedim(-1, 0)[None]] * 2)  # type: ignore[misc]
+            load_lpips("alex")(*[smaller.movedim(-1, 0)[None]] * 2)  # type: ignore[misc]
 
 
+@pytest.fixture
+def random_vgg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> torch.nn.Module:
+    """VGG-16 with random features, which the variable names."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = torchvision.models.vgg16(weights=None)
+    torch.save(model.features.state_dict(), tmp_path / "vgg.pth")
+    monkeypatch.setenv(NETWORKS["vgg"].weights_variable, str(tmp_path / "vgg.pth"))
+    return model
+
+
+def test_vgg_is_torchmetrics_with_the_weights_of_the_file(random_vgg: torch.nn.Module, monkeypatch: pytest.MonkeyPatch):
+    """Torchmetrics' own class, whose network is given the same weights in memory."""
+    found = lpips(noisy(IMAGE, 0.2), IMAGE, "vgg")
+    monkeypatch.setattr(torchvision.models, "vgg16", lambda weights: random_vgg)
+    own = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
+    pictures = [image.movedim(-1, 0)[None] for image in (noisy(IMAGE, 0.2), IMAGE)]
+    assert found == pytest.approx(float(own(*pictures)), rel=1e-6) and float(own(*pictures)) > 0.0
+    assert lpips(IMAGE, IMAGE, "vgg") == 0.0
+
+
+def test_pictures_have_a_distance_from_the_size_on_that_vgg_takes(random_vgg: torch.nn.Module):
+    side = NETWORKS["vgg"].smallest_side
+    small = IMAGE[:side, :side]
+    assert isinstance(lpips(noisy(small, 0.1), small, "vgg"), float)
+    for smaller in (small[:-1], small[:, :-1]):
+        assert lpips(smaller, smaller, "vgg") == f"the frame is smaller than {side} x {side} pixels"
+        with pytest.raises(RuntimeError, match="too small"):
+            load_lpips("vgg")(*[smaller.movedim(-1, 0)[None]] * 2)  # type: ignore[misc]
+
+
+def test_one_network_without_weights_leaves_the_other_as_it_is(
+    random_vgg: torch.nn.Module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nothing"))
+    assert lpips(IMAGE, IMAGE) == "its weights could not be loaded" and lpips(IMAGE, IMAGE, "vgg") == 0.0
+
+
+@pytest.mark.parametrize("net", NETWORKS)
 @pytest.mark.parametrize("content", [None, b"", b"no weights"])
 def test_without_weights_there_is_no_distance_and_one_line_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, content: bytes | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, content: bytes | None, net: Net
 ):
     path = tmp_path / "weights.pth"
     if content is not None:
         path.write_bytes(content)
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(path))
-    assert [lpips(IMAGE, IMAGE), lpips(IMAGE, IMAGE)] == ["its weights could not be loaded"] * 2
+    monkeypatch.setenv(NETWORKS[net].weights_variable, str(path))
+    assert [lpips(IMAGE, IMAGE, net), lpips(IMAGE, IMAGE, net)] == ["its weights could not be loaded"] * 2
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 1 and WEIGHTS_VARIABLE in lines[0]
+    assert len(lines) == 1 and NETWORKS[net].weights_variable in lines[0]
 
 
 def test_weights_that_do_not_fit_are_no_distance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -7,16 +7,9 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
+from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
-from enerf_ns.evaluation.metrics import (
-    align_brightness,
-    align_channels,
-    correlation,
-    depth_rmse,
-    fit_fault,
-    image_metrics,
-)
-from enerf_ns.sensor.response import inverse_linlog, linlog
+from enerf_ns.evaluation.metrics import correlation, depth_rmse, event_scores, psnr, ssim
 
 
 def pictures(count: int, seed: int = 0) -> list[Tensor]:
@@ -25,121 +18,68 @@ def pictures(count: int, seed: int = 0) -> list[Tensor]:
     return [torch.from_numpy(0.05 + 0.2 * i + 0.3 * random.random((12, 16, 3))) for i in range(count)]
 
 
-def test_alignment_recovers_a_known_scale_and_offset_over_several_pictures():
-    rendered = pictures(3)
-    recorded = [inverse_linlog(0.8 * linlog(image) + 0.5) for image in rendered]
-    aligned, (scale, offset) = align_brightness(rendered, recorded)
-    assert scale == pytest.approx(0.8, abs=1e-9) and offset == pytest.approx(0.5, abs=1e-9)
-    for image, truth in zip(aligned, recorded, strict=True):
-        torch.testing.assert_close(image, truth, rtol=0, atol=1e-9)
-
-
-def test_alignment_is_the_least_squares_of_numpy_over_all_pictures_together():
-    rendered, recorded = pictures(3), pictures(3, seed=1)[::-1]
-    x, y = (torch.cat([linlog(image).flatten() for image in images]).numpy() for images in (rendered, recorded))
-    expected = np.linalg.lstsq(np.column_stack([x, np.ones_like(x)]), y, rcond=None)[0]
-    np.testing.assert_allclose(align_brightness(rendered, recorded)[1], expected, rtol=1e-9)
-
-
-def test_channels_align_by_the_least_squares_of_numpy_each_by_itself():
-    rendered = pictures(3)
-    scale, offset = torch.tensor([0.6, 1.1, 0.9]), torch.tensor([0.9, -0.4, 0.1])
-    noise = pictures(3, seed=1)
-    recorded = [
-        inverse_linlog(scale * linlog(a) + offset + 0.05 * b).clamp(0, 1) for a, b in zip(rendered, noise, strict=True)
-    ]
-    aligned, fits = align_channels(rendered, recorded)
-    assert len(fits) == 3 and [image.shape for image in aligned] == [image.shape for image in rendered]
-    for channel, fit in enumerate(fits):
-        x, y = (
-            torch.cat([linlog(image[..., channel]).flatten() for image in images]).numpy()
-            for images in (rendered, recorded)
-        )
-        expected = np.linalg.lstsq(np.column_stack([x, np.ones_like(x)]), y, rcond=None)[0]
-        np.testing.assert_allclose(fit, expected, rtol=1e-9)
-        for image, original in zip(aligned, rendered, strict=True):
-            truth = inverse_linlog(expected[0] * linlog(original[..., channel]) + expected[1]).clamp(0, 1)
-            torch.testing.assert_close(image[..., channel], truth, rtol=0, atol=1e-9)
-
-
-def test_channels_of_equal_pictures_align_as_grey_ones_do():
-    grey, recorded = ([image[..., :1] for image in pictures(2, seed)] for seed in (0, 1))
-    aligned, fit = align_brightness(grey, recorded)
-    in_colour, fits = align_channels(*([image.repeat(1, 1, 3) for image in images] for images in (grey, recorded)))
-    assert fits == [fit] * 3
-    for image, expected in zip(in_colour, aligned, strict=True):
-        torch.testing.assert_close(image, expected.expand(-1, -1, 3), rtol=0, atol=0)
-
-
-def test_alignment_keeps_the_type_of_the_pictures_and_their_range():
-    rendered = [image.float() for image in pictures(2)]
-    recorded = [(4.0 * image).clamp(max=1.0) for image in rendered]
-    aligned, _ = align_brightness(rendered, recorded)
-    assert all(image.dtype == torch.float32 and image.min() >= 0 and image.max() <= 1 for image in aligned)
-
-
-def test_constant_renders_align_to_the_mean_of_the_recorded():
-    recorded = pictures(2)
-    mean = torch.stack([linlog(image) for image in recorded]).mean()
-    aligned, (scale, offset) = align_brightness([torch.full((12, 16, 3), 0.4)] * 2, recorded)
-    assert scale == 0.0 and offset == pytest.approx(mean.item())
-    torch.testing.assert_close(aligned[1], torch.full((12, 16, 3), inverse_linlog(mean).item()))
-
-
-def test_a_negative_and_flat_pictures_are_no_fit_and_a_picture_is_one():
-    recorded = pictures(2)
-    negative = [inverse_linlog(7.0 - 0.61 * linlog(image)) for image in recorded]
-    flat = [torch.full((12, 16, 3), 0.1)] * 2
-    good, bad = (align_brightness(rendered, recorded)[1] for rendered in (recorded, negative))
-    assert bad[0] == pytest.approx(-1 / 0.61)
-    assert fit_fault([good]) is None
-    assert str(fit_fault([bad])).startswith("the render is a negative of the frame (brightness scale -1.64); check the")
-    assert fit_fault([good, bad]) == fit_fault([bad])
-    for pair in ((flat, recorded), (recorded, flat), (flat, flat)):
-        fit = align_brightness(*pair)[1]
-        assert fit[0] == 0.0
-        assert str(fit_fault([fit])).startswith("no brightness scale fits, since what is rendered or recorded is flat")
-    red_negative = [torch.cat([a[..., :1], b[..., 1:]], -1) for a, b in zip(negative, recorded, strict=True)]
-    assert "negative" in str(fit_fault(align_channels(red_negative, recorded)[1]))
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_render_with_a_pixel_that_is_not_finite_has_no_score(value: float):
     rendered, recorded = pictures(1)[0], pictures(1, seed=1)[0]
     rendered[3, 4, 1] = value
-    assert image_metrics(rendered, recorded) == dict.fromkeys(("psnr", "ssim"), "the render is not finite")
-    assert correlation(rendered, recorded) == "the render is not finite"
+    assert {score(rendered, recorded) for score in (psnr, ssim, correlation)} == {"the render is not finite"}
 
 
 def test_pictures_smaller_than_the_window_of_ssim_have_a_psnr():
     smallest, recorded = (picture[:11, :11] for picture in (pictures(1)[0], pictures(1, seed=1)[0]))
-    assert all(isinstance(score, float) and np.isfinite(score) for score in image_metrics(smallest, recorded).values())
+    found: Any = ssim(smallest, recorded)
+    assert np.isfinite(found)
     for cut in (slice(10), (slice(None), slice(10))):
-        scores = image_metrics(smallest[cut], recorded[cut])
-        assert scores["ssim"] == "the frame is smaller than 11 x 11 pixels"
+        assert ssim(smallest[cut], recorded[cut]) == "the frame is smaller than 11 x 11 pixels"
         expected = peak_signal_noise_ratio(recorded[cut].numpy(), smallest[cut].numpy(), data_range=1.0)
-        assert scores["psnr"] == pytest.approx(expected, abs=1e-9)
+        assert psnr(smallest[cut], recorded[cut]) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("values", [(0.4, 0.4), (0.4, 0.6), (0.0, 1.0)])
 def test_constant_pictures_have_scores_but_no_correlation(values: tuple[float, float]):
     constant = [torch.full((12, 16, 3), value) for value in values]
-    scores = image_metrics(*constant)
-    assert isinstance(scores["ssim"], float) and np.isfinite(scores["ssim"])
+    found: Any = ssim(*constant)
+    assert np.isfinite(found)
     assert correlation(*constant) == correlation(constant[0], pictures(1)[0]) == "what is rendered is flat"
     assert correlation(pictures(1)[0], constant[1]) == "what is recorded is flat"
-    assert scores["psnr"] == pytest.approx(120.0 if values[0] == values[1] else -20 * np.log10(values[1] - values[0]))
+    assert psnr(*constant) == pytest.approx(120.0 if values[0] == values[1] else -20 * np.log10(values[1] - values[0]))
 
 
-def test_scores_equal_those_of_scikit_image():
+def test_scores_equal_those_of_scikit_image_and_torchmetrics():
     random = np.random.default_rng(0)
     recorded = random.random((40, 50, 3)).astype(np.float32)
     rendered = (recorded + 0.1 * random.standard_normal(recorded.shape)).clip(0, 1).astype(np.float32)
-    scores = image_metrics(torch.from_numpy(rendered), torch.from_numpy(recorded))
-    assert scores["psnr"] == pytest.approx(peak_signal_noise_ratio(recorded, rendered, data_range=1.0), abs=1e-4)
+    pair = torch.from_numpy(rendered), torch.from_numpy(recorded)
+    assert psnr(*pair) == pytest.approx(peak_signal_noise_ratio(recorded, rendered, data_range=1.0), abs=1e-4)
+    assert psnr(*pair) == pytest.approx(float(PeakSignalNoiseRatio(data_range=1.0)(*pair)), abs=1e-4)
     gaussian = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    ssim: Any = structural_similarity(recorded, rendered, data_range=1.0, channel_axis=2, full=True, **gaussian)
-    assert scores["ssim"] == pytest.approx(ssim[1].mean(), abs=5e-4)  # they mirror the border differently
+    expected: Any = structural_similarity(recorded, rendered, data_range=1.0, channel_axis=2, full=True, **gaussian)
+    assert ssim(*pair) == pytest.approx(expected[1].mean(), abs=5e-4)  # they mirror the border differently
+    batches = [image.movedim(-1, 0)[None] for image in pair]
+    assert ssim(*pair) == pytest.approx(float(StructuralSimilarityIndexMeasure(data_range=1.0)(*batches)), abs=1e-6)
+
+
+def test_scores_of_events_are_those_of_a_loop():
+    random = np.random.default_rng(0)
+    measured = 0.25 * random.integers(-3, 4, 500)
+    predicted = 0.9 * measured + 0.2 * random.standard_normal(500)
+    scores = event_scores(torch.from_numpy(predicted), torch.from_numpy(measured), 0.25)
+    errors = [((a - b) / 0.25) ** 2 for a, b in zip(predicted, measured, strict=True)]
+    right = [(a > 0) == (b > 0) for a, b in zip(predicted, measured, strict=True) if b != 0]
+    assert scores["event_correlation"] == pytest.approx(np.corrcoef(predicted, measured)[0, 1], abs=1e-9)
+    assert scores["event_rmse"] == pytest.approx(np.sqrt(sum(errors) / 500))
+    assert scores["event_sign"] == pytest.approx(sum(right) / len(right)) and 0.5 < sum(right) / len(right) < 1.0
+
+
+def test_changes_that_are_flat_or_not_finite_have_the_scores_that_they_can_have():
+    measured = torch.tensor([0.2, -0.2, 0.4])
+    flat = event_scores(torch.zeros(3), measured, 0.2)
+    assert flat["event_correlation"] == "what is rendered is flat" and flat["event_sign"] == 0.0
+    assert flat["event_rmse"] == pytest.approx(np.sqrt(2.0))
+    spoilt = event_scores(torch.tensor([0.1, torch.nan, 0.1]), measured, 0.2)
+    assert set(spoilt.values()) == {"the render is not finite"}
+    nothing = event_scores(measured, torch.zeros(3), 0.2)
+    assert nothing["event_sign"] == "no pair measured a change"
 
 
 def test_correlation_is_that_of_numpy_and_blind_to_scale_and_offset():

@@ -31,8 +31,9 @@ def no_video(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_report_holds_scores_a_picture_and_a_flight(run: Run, tmp_path: Path, no_video: None):
     scores = write_report(run, tmp_path / "new" / "report", {"train_seconds": 1.5})
     assert json.loads((tmp_path / "new/report/scores.json").read_text()) == scores
+    assert scores["protocol"] == "log-affine-set"
     assert scores["train_seconds"] == 1.5 and scores["lpips"] is None
-    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "brightness_scale", "fps"} <= set(scores)
+    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "held_out_on_path", "fps"} <= set(scores)
     assert Image.open(tmp_path / "new/report/side-by-side.png").size[0] > 1000
     path = json.loads((tmp_path / "new/report/camera_path.json").read_text())
     assert path == camera_path(run.pipeline.datamanager.eval_dataset.cameras)

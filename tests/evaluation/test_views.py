@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from PIL import Image
 from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.evaluation.metrics import align_brightness
 from enerf_ns.evaluation.runs import Run
-from enerf_ns.evaluation.views import HeldOutView, held_out_views, save_pictures
+from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_views, save_pictures
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 METRES = 2.5
@@ -61,75 +62,70 @@ def test_depth_is_along_the_optical_axis_and_in_metres(shown: Any):
         torch.testing.assert_close(view.depth, torch.full((24, 32, 1), METRES), rtol=1e-5, atol=0)
 
 
-def test_brightness_is_fitted_once_over_all_views(shown: Any):
-    views, summary = held_out_views(shown)
+def test_renders_are_as_the_field_has_them_and_aligned_once_over_all_views(shown: Any):
+    views, _ = held_out_views(shown)
+    for number, view in enumerate(views):
+        expected = torch.linspace(0.5, 0.1, 32).expand(24, 32)[..., None].expand(-1, -1, 3) + 0.1 * (number + 1)
+        torch.testing.assert_close(view.rendered, expected, rtol=0, atol=0)
+    aligned, parameters = aligned_views(views)
     x, y = (
         linlog(torch.stack([getattr(view, name) for view in views]).double()).flatten().numpy()
-        for name in ("unaligned", "recorded")
+        for name in ("rendered", "recorded")
     )
     scale, offset = np.polyfit(x, y, 1)
-    assert summary["brightness_scale"] == pytest.approx(scale, rel=1e-6)
-    assert summary["brightness_offset"] == pytest.approx(offset, rel=1e-6)
-    for view in views:
-        expected = inverse_linlog(scale * linlog(view.unaligned.double()) + offset).clamp(0, 1).float()
-        torch.testing.assert_close(view.rendered, expected, rtol=0, atol=1e-6)
+    assert parameters == pytest.approx({"brightness_scale": scale, "brightness_offset": offset}, rel=1e-6)
+    for view, shown_view in zip(views, aligned, strict=True):
+        expected = inverse_linlog(scale * linlog(view.rendered.double()) + offset).float()
+        torch.testing.assert_close(shown_view.rendered, expected, rtol=0, atol=1e-6)
+        assert shown_view.not_aligned is None and shown_view.time == view.time
 
 
-def test_one_render_that_is_not_finite_leaves_the_fit_of_the_others_as_it_would_be_without(
-    shown: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("supervision", ["events", "frames"])
+def test_every_run_is_aligned_alike_whatever_it_learnt_from(
+    shown: Any, monkeypatch: pytest.MonkeyPatch, supervision: str
 ):
-    without = [view for i, view in enumerate(held_out_views(shown)[0]) if i != 1]
-    recorded = [view.recorded for view in without if view.recorded is not None]
-    aligned, (scale, offset) = align_brightness([view.unaligned for view in without], recorded)
-    sound = shown.model.get_outputs_for_camera_ray_bundle
-    calls = []
-
-    def outputs(rays: Any) -> dict[str, torch.Tensor]:
-        calls.append(rays)
-        made = sound(rays)
-        made["rgb"] = made["rgb"] - 0.3  # as of the first three calls
-        if len(calls) == 2:
-            made["rgb"][5, 6] = torch.nan
-        return made
-
-    monkeypatch.setattr(shown.model, "get_outputs_for_camera_ray_bundle", outputs)
-    views, summary = held_out_views(shown)
-    assert summary["brightness_scale"] == pytest.approx(scale) and summary["brightness_offset"] == pytest.approx(offset)
-    for view, expected in zip((views[0], views[2]), aligned, strict=True):
-        torch.testing.assert_close(view.rendered, expected, rtol=0, atol=1e-6)
-    assert views[1].rendered.isnan().sum() == 3 and all(view.not_aligned is None for view in views)
+    monkeypatch.setattr(shown.datamanager.config, "supervision", supervision)
+    table = summary_scores(*held_out_views(shown))
+    assert table["protocol"] == "log-affine-set" and isinstance(table["brightness_scale"], float)
 
 
-def test_a_negative_and_what_is_flat_is_shown_as_it_is_and_why(shown: Any, monkeypatch: pytest.MonkeyPatch):
-    sound = shown.model.get_outputs_for_camera_ray_bundle
+def test_one_render_that_is_not_finite_is_left_as_it_is_and_the_others_are_aligned_as_without(shown: Any):
+    views, _ = held_out_views(shown)
+    without, parameters = aligned_views([views[0], views[2]])
+    views[1].rendered = views[1].rendered.clone()
+    views[1].rendered[5, 6] = torch.nan
+    aligned, found = aligned_views(views)
+    assert found == parameters
+    for view, expected in zip((aligned[0], aligned[2]), without, strict=True):
+        torch.testing.assert_close(view.rendered, expected.rendered, rtol=0, atol=0)
+    assert aligned[1].rendered.isnan().sum() == 3 and all(view.not_aligned is None for view in aligned)
+
+
+def test_a_negative_and_what_is_flat_is_shown_as_it_is_and_why(shown: Any):
     for change, reason in (
         (lambda rgb: 1.2 - rgb, "the render is a negative of the frame (brightness scale -"),
-        (lambda rgb: 0.0 * rgb, "no brightness scale fits"),
+        (lambda rgb: 0.0 * rgb, "no brightness fits, since what is rendered or recorded is flat"),
     ):
-
-        def outputs(rays: Any, change: Any = change) -> dict[str, torch.Tensor]:
-            made = sound(rays)
-            return made | {"rgb": change(made["rgb"])}
-
-        monkeypatch.setattr(shown.model, "get_outputs_for_camera_ray_bundle", outputs)
-        views, summary = held_out_views(shown)
-        assert isinstance(summary["brightness_scale"], float) and summary["brightness_scale"] <= 0
-        for view in views:
-            assert view.not_aligned is not None and view.not_aligned.startswith(reason)
-            torch.testing.assert_close(view.rendered, view.unaligned, rtol=0, atol=0)
+        views = [replace(view, rendered=change(view.rendered)) for view in held_out_views(shown)[0]]
+        aligned, parameters = aligned_views(views)
+        assert parameters == {}
+        for view, shown_view in zip(views, aligned, strict=True):
+            assert shown_view.not_aligned is not None and shown_view.not_aligned.startswith(reason)
+            torch.testing.assert_close(shown_view.rendered, view.rendered, rtol=0, atol=0)
 
 
-def test_brightness_that_frames_fix_is_left_as_it_is(shown: Any, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(shown.datamanager.config, "supervision", "frames")
-    views, summary = held_out_views(shown)
-    assert set(summary) == {"num_rays_per_sec", "fps"}
-    for view in views:
-        torch.testing.assert_close(view.rendered, view.unaligned, rtol=0, atol=0)
+def test_the_median_depth_is_of_what_is_known():
+    rendered = torch.tensor([[1.0, 2.0], [5.0, torch.inf]])[..., None]
+    recorded = torch.tensor([[0.0, 7.0], [7.0, 9.0]])[..., None]
+    picture = torch.zeros(2, 2, 3)
+    assert HeldOutView(picture, picture, rendered, recorded, 0).median_depth == 7.0
+    assert HeldOutView(picture, picture, rendered, 0.0 * recorded, 0).median_depth == 2.0
+    assert HeldOutView(picture, picture, torch.nan * rendered, None, 0).median_depth == 1.0
 
 
 def test_without_frames_there_are_views_with_nothing_recorded(run_without_frames: Run):
     views, summary = held_out_views(run_without_frames.pipeline)
-    assert len(views) == 3
+    assert len(views) == 3 and aligned_views(views) == (views, {})
     assert all(view.recorded is None and view.recorded_depth is None for view in views)
     assert set(summary) == {"num_rays_per_sec", "fps", "event_correlation"}
     assert isinstance(summary["event_correlation"], float) and -1 <= summary["event_correlation"] <= 1
@@ -140,8 +136,8 @@ def test_pictures_show_the_frame_beside_the_render(tmp_path: Path):
     recorded, rendered = (torch.rand(4, 5, 3, generator=generator) for _ in range(2))
     depth = torch.ones(4, 5, 1)
     views = [
-        HeldOutView(recorded, 2 * rendered - 0.5, rendered, depth, None, 0),
-        HeldOutView(None, rendered, rendered, depth, None, 1),
+        HeldOutView(recorded, 2 * rendered - 0.5, depth, None, 0),
+        HeldOutView(None, rendered, depth, None, 1),
     ]
     save_pictures(views, tmp_path / "new" / "pictures")
     pictures = [np.asarray(Image.open(file)) for file in sorted((tmp_path / "new" / "pictures").iterdir())]
@@ -158,7 +154,7 @@ def test_a_full_disk_leaves_no_half_of_a_picture(tmp_path: Path, monkeypatch: py
         raise OSError(errno.ENOSPC, "No space left on device")
 
     picture = torch.full((4, 5, 3), torch.nan)
-    view = HeldOutView(None, picture, picture, torch.ones(4, 5, 1), None, 0)
+    view = HeldOutView(None, picture, torch.ones(4, 5, 1), None, 0)
     save_pictures([view], tmp_path)
     assert not np.asarray(Image.open(tmp_path / "eval_img_0000.png")).any(), "what is not finite is black"
     before = (tmp_path / "eval_img_0000.png").read_bytes()
