@@ -19,10 +19,10 @@ import torch
 import tyro
 
 from enerf_ns.enerf_pipeline import EnerfPipeline
-from enerf_ns.evaluation.report import side_by_side
 from enerf_ns.evaluation.runs import method_config, set_up
 from enerf_ns.evaluation.scores import mean_scores
-from enerf_ns.evaluation.views import aligned_views, held_out_views
+from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.report.pictures import shown_numbers, side_by_side
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "events": {},
@@ -94,7 +94,8 @@ class ErrorAgainstTime:
             row = {"setting": name, "seconds": round(trained, 1), "steps": step, **mean_scores(views)[0]}
             rows.append(row | {"rays_per_second": summary["num_rays_per_sec"]})
             print(rows[-1], flush=True)
-        picture = side_by_side(aligned_views(views)[0], pipeline.datamanager.eval_dataset.recording)
+        shown = [views[number] for number in shown_numbers(len(views))]
+        picture = side_by_side(shown, pipeline.datamanager.eval_dataset.recording)
         picture.savefig(self.output_dir / f"{name}.png")
         return rows
 

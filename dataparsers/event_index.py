@@ -16,6 +16,8 @@ from enerf_ns.dataparsers.recording import Events
 
 EVENTS_IN_PICTURE = 0.2
 """Events drawn into one picture, as a share of the sensor's pixels."""
+ON_COLOUR, OFF_COLOUR, NO_EVENT = (205, 50, 50), (50, 70, 205), (255, 255, 255)
+"""Colours of a picture where it became brighter, where darker, and where nothing fired; red, green, blue."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,6 @@ def event_picture(index: EventIndex, camera: Camera, time: int) -> UInt8[np.ndar
     latest = index.times[event].topk(min(int(EVENTS_IN_PICTURE * camera.width * camera.height), len(event))).indices
     pixels, event = pixels[latest], event[latest]
     positive = index.positives[event] > torch.where(event > 0, index.positives[event - 1], 0)
-    picture = np.full((camera.height * camera.width, 3), 255, dtype=np.uint8)
-    picture[pixels] = np.where(positive[:, None], (205, 50, 50), (50, 70, 205))
+    picture = np.tile(np.array(NO_EVENT, np.uint8), (camera.height * camera.width, 1))
+    picture[pixels] = np.where(positive[:, None], ON_COLOUR, OFF_COLOUR)
     return camera.undistort(picture.reshape(camera.height, camera.width, 3))

@@ -164,6 +164,6 @@ print(*[name for name in {UNUSED!r} if name in sys.modules])
 
 
 UNUSED = (
-    "hdf5plugin", "rosbags", "trimesh", "enerf_ns.simulator.engine", "enerf_ns.evaluation.report",
+    "hdf5plugin", "rosbags", "trimesh", "enerf_ns.simulator.engine", "enerf_ns.report",
     "enerf_ns.dataparsers.inspection", "enerf_ns.numerics", "torchmetrics.image.lpip",
 )  # fmt: skip

@@ -7,20 +7,19 @@ from pathlib import Path
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.evaluation.report import write_report
 from enerf_ns.evaluation.runs import method_config, train
 from enerf_ns.ranges import check_ranges
+from enerf_ns.report.writing import write_report
 from enerf_ns.scripts.simulate import Simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
 
 @dataclass
 class Demo:
-    """Simulate an event camera, train on its events alone, score the field, write a picture and a video."""
+    """Simulate an event camera, train on its events alone, score the field, write a report."""
 
     output_dir: Path = Path("outputs/demo")
-    """Folder for the recording, the run, scores.json, side-by-side.png and video.mp4."""
+    """Folder for the recording, the run, and its report."""
     max_num_iterations: int | None = None
     """Training steps. None: as many as the method enerf takes."""
 
@@ -36,8 +35,5 @@ class Demo:
         else:
             Simulate(recording, SimulationSettings("shapes")).main()
         run = train(config)
-        assert run.train_seconds is not None
-        events = len(index_events(run.pipeline.datamanager.train_dataset.recording))
-        scores = write_report(run, output_dir, {"train_seconds": round(run.train_seconds, 1), "events": events})
-        CONSOLE.print(scores)
-        CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir}", markup=False)
+        CONSOLE.print(write_report([run], output_dir))
+        CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)

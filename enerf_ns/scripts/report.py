@@ -1,29 +1,45 @@
-"""`enerf report`: scores, picture and video of a trained run."""
+"""`enerf report`: error against time, scores, pictures and videos of runs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Optional  # tyro reads these annotations on Python 3.10
 
 import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from enerf_ns.evaluation.report import write_report
-from enerf_ns.evaluation.runs import load
+from enerf_ns.report.writing import Scoring, write_report
 
 
 @dataclass
 class Report:
-    """Score a trained run on its held-out frames; write scores.json, side-by-side.png and video.mp4."""
+    """Tell how good runs are and how long they took: a page, Markdown, a table of error against time, pictures, videos.
 
-    load_config: Annotated[Path, tyro.conf.Positional]
-    """config.yml of the run."""
-    output_dir: Path | None = None
-    """Folder for the three files. None: the folder of the run."""
+    Of runs that are still going or crashed, and of those whose recording is gone, whatever there is.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or their files config.yml."""
+    output_dir: Optional[Path] = None  # noqa: UP045
+    """Folder for the report. None: that of the run; of several, ./report."""
+    reach: Optional[tuple[float, ...]] = None  # noqa: UP045
+    """PSNR in dB whose training time is told. None: some that the runs reach."""
+    video: bool = True
+    """Render a flight past the held-out cameras."""
+    protocol: Optional[str] = None  # noqa: UP045
+    """Score held-out frames anew by this protocol."""
+    lpips: Optional[tuple[str, ...]] = None  # noqa: UP045
+    """Score anew, with these networks of LPIPS."""
+    crop: Optional[tuple[int, int, int, int]] = None  # noqa: UP045
+    """Score anew these pixels alone: first and last row, first and last column, the last ones excluded."""
 
     def main(self) -> None:
-        run = load(self.load_config)
-        output_dir = self.output_dir or self.load_config.parent
-        CONSOLE.print(write_report(run, output_dir))
-        CONSOLE.print(f"scores.json, side-by-side.png and video.mp4 are in {output_dir.resolve()}", markup=False)
+        output_dir = self.output_dir
+        if output_dir is None and len(self.runs) == 1:
+            output_dir = self.runs[0] if self.runs[0].is_dir() else self.runs[0].parent
+        output_dir = (output_dir or Path("report")).expanduser().resolve()
+        scoring = Scoring(self.protocol, self.lpips, self.crop)
+        scores = write_report(self.runs, output_dir, self.reach, scoring, self.video)
+        CONSOLE.print(scores)
+        CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,231 @@
+"""What a trained run shows: held-out frames side by side with what was recorded, and a flight past their cameras."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.depth_range import scene_depth_range
+from enerf_ns.dataparsers.errors import OutputError
+from enerf_ns.dataparsers.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
+from enerf_ns.dataparsers.files import in_colour, load_image
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
+from enerf_ns.evaluation.metrics import is_known
+from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.views import HeldOutView
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from nerfstudio.cameras.cameras import Cameras
+
+PICTURE_ROWS = 3
+"""Number of held-out frames shown in the picture."""
+POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event": NO_EVENT}
+"""What the colours of an `event_picture` mean."""
+KEY_POSES = 7
+"""Number of held-out cameras that the video flies past."""
+VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
+
+
+@dataclass(frozen=True)
+class Column:
+    """What is shown of every view, one below the other."""
+
+    title: str
+    pictures: list[np.ndarray | None]
+    """Of each view: colours in [0, 1] (height, width, 3), or values (height, width), not a number where unknown."""
+    bar: str = ""
+    """What the values are, with their unit."""
+    colours: str = ""
+    limits: tuple[float, float] = (0.0, 1.0)
+    """Values at the ends of the colours."""
+
+
+def shown_numbers(number: int) -> list[int]:
+    """Which of the held-out frames are shown."""
+    return np.unique(np.linspace(0, number - 1, PICTURE_ROWS).round().astype(int)).tolist()
+
+
+def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Figure:
+    """Frame, blurred frame, render, error, rendered and true depth, and events of some held-out frames, side by side.
+
+    What the recording does not have is left out.
+
+    Args:
+        views: Those that are shown, at least one.
+        recording: Of which the events are. Of held-out frames on a clock of their own, events are not shown.
+    """
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    columns = _columns(views, recording)
+    height, width = views[0].depth.shape[:2]
+    figure = Figure(
+        figsize=(2.35 * len(columns), 1.1 + 2.3 * len(views) * height / width), layout="constrained", dpi=110
+    )
+    axes = figure.subplots(len(views), len(columns), squeeze=False)
+    for column, below in zip(columns, axes.T, strict=True):
+        below[0].set_title(column.title)
+        for axis, picture in zip(below, column.pictures, strict=True):
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if picture is None:
+                axis.text(
+                    0.5, 0.5, "none at this time", ha="center", va="center", color="grey", transform=axis.transAxes
+                )
+                axis.spines[:].set_visible(False)
+            elif column.bar:
+                low, high = column.limits
+                colours = colormaps[column.colours].with_extremes(bad="#c9ced8")
+                shown = axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
+            else:
+                axis.imshow(picture)
+        if column.bar:
+            figure.colorbar(shown, ax=below, label=column.bar, location="bottom", shrink=0.9, aspect=16, pad=0.02)
+        elif column.title == "events":
+            handles = [
+                Patch(facecolor=np.array(colour) / 255, edgecolor="grey", label=what)
+                for what, colour in POLARITIES.items()
+            ]
+            legend = below[-1].legend(
+                handles=handles,
+                loc="upper center",
+                bbox_to_anchor=(0.5, 0.0),
+                frameon=False,
+                fontsize=9,
+                handlelength=1,
+            )
+            legend.set_in_layout(False)  # it lies beside the bars
+    if recording.held_out_frames is None:
+        for axis, view in zip(axes[:, 0], views, strict=True):
+            axis.set_ylabel(f"{view.time * 1e-9:.2f} s")
+    return figure
+
+
+def _columns(views: Sequence[HeldOutView], recording: EventRecording) -> list[Column]:
+    rendered = [view.rendered.nan_to_num().clamp(0, 1).numpy() for view in views]
+    recorded = [None if view.recorded is None else view.recorded.clamp(0, 1).numpy() for view in views]
+    columns = []
+    if any(picture is not None for picture in recorded):
+        columns.append(Column("held-out frame", recorded))
+    blurred = [_blurred_frame(recording, view.time) for view in views]
+    if any(picture is not None for picture in blurred):
+        columns.append(Column("blurred frame", blurred))
+    columns.append(Column("render", rendered))
+    if any(picture is not None for picture in recorded):
+        errors = [
+            None if frame is None else view.rendered.mean(-1).numpy() - frame.mean(-1)
+            for view, frame in zip(views, recorded, strict=True)
+        ]
+        most = max(_quantile([error for error in errors if error is not None], 0.99, absolute=True), 0.01)
+        columns.append(Column("error", errors, "render - frame", "PuOr_r", (-most, most)))
+    depths = [view.depth[..., 0].numpy() for view in views]
+    true = [_known_depth(view) for view in views]
+    of_scene = [depth for depth in true if depth is not None] or depths
+    limits = _quantile(of_scene, 0.01), _quantile(of_scene, 0.99, otherwise=1.0)
+    columns.append(Column("rendered depth", depths, "metres", "viridis", limits))
+    if any(depth is not None for depth in true):
+        columns.append(Column("true depth", true, "metres; grey: unknown", "viridis", limits))
+    if recording.held_out_frames is None:
+        index = index_events(recording)
+        columns.append(Column("events", [event_picture(index, recording.camera, view.time) for view in views]))
+    return columns
+
+
+def _blurred_frame(recording: EventRecording, time: int) -> np.ndarray | None:
+    """The blurred frame of an instant, undistorted, in [0, 1], (height, width, 3)."""
+    frames = recording.blurred_frames
+    if frames is None or recording.held_out_frames is not None or time not in frames.times:
+        return None
+    file = frames.filenames[int(np.flatnonzero(frames.times == time)[0])]
+    return in_colour(frames.camera.undistort(load_image(file))) / 255.0
+
+
+def _known_depth(view: HeldOutView) -> np.ndarray | None:
+    """Recorded depth, not a number where it is unknown, (height, width)."""
+    depth = view.recorded_depth
+    return None if depth is None else torch.where(is_known(depth), depth, torch.nan)[..., 0].numpy()
+
+
+def _quantile(pictures: Sequence[np.ndarray], share: float, absolute: bool = False, otherwise: float = 0.0) -> float:
+    """Quantile of the finite values of all pictures; another number where there is none."""
+    values = np.concatenate([picture[np.isfinite(picture)] for picture in pictures])
+    return float(np.quantile(np.abs(values) if absolute else values, share)) if len(values) else otherwise
+
+
+def camera_path(cameras: Cameras) -> dict:
+    """A smooth flight past some of the cameras, as the viewer saves it and `ns-render camera-path` reads it.
+
+    Cubic through the places of `KEY_POSES` cameras, slerp between their directions, with sides of the picture even, as
+    video players want them.
+    """
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, KEY_POSES).round().astype(int))
+    poses = cameras.camera_to_worlds[chosen].double().cpu().numpy()
+    if len(poses) == 1:
+        poses = np.repeat(poses, 2, axis=0)
+    flight = Trajectory(np.arange(len(poses)) * 10**9, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat())
+    times = evenly_spaced(flight.start, flight.end, int(VIDEO_SECONDS * VIDEO_FPS))
+    matrices = np.concatenate(
+        [flight.poses(torch.from_numpy(times)).numpy(), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(times), 1, 1))], axis=1
+    )
+    height, width = (int(size[0]) // 2 * 2 for size in (cameras.height, cameras.width))
+    fov = math.degrees(2.0 * math.atan(0.5 * height / float(cameras.fy[0])))
+    return {
+        "camera_type": "perspective",
+        "render_height": height,
+        "render_width": width,
+        "fps": VIDEO_FPS,
+        "seconds": VIDEO_SECONDS,
+        "camera_path": [
+            {"camera_to_world": matrix.flatten().tolist(), "fov": fov, "aspect": width / height} for matrix in matrices
+        ],
+    }
+
+
+def render_video(run: Run, camera_path_file: Path, output: Path) -> None:
+    """Render a flight by `ns-render camera-path`: brightness on the left, depth on the right.
+
+    Depth is coloured from the nearest to the farthest of the scene.
+
+    Args:
+        run: A trained run.
+        camera_path_file: JSON of a `camera_path`.
+        output: The .mp4 file, which is whole afterwards, or as it was before.
+
+    Raises:
+        OSError: It cannot be written.
+        OutputError: The same, where it is ffmpeg that finds out.
+    """
+    from nerfstudio.scripts.render import RenderCameraPath
+
+    manager = run.pipeline.datamanager
+    near, far = scene_depth_range(manager.eval_dataset.recording, manager.config.dataparser.depth_range)
+    scale = manager.train_dataparser_outputs.dataparser_scale
+    partial = output.with_name(f".{output.stem}.partial-{os.getpid()}{output.suffix}")
+    try:
+        RenderCameraPath(
+            load_config=run.config_file,
+            output_path=partial,
+            rendered_output_names=["rgb", "depth"],
+            camera_path_filename=camera_path_file,
+            depth_near_plane=scale * near,
+            depth_far_plane=scale * far,
+        ).main()
+        partial.replace(output)
+    except RuntimeError as error:
+        if not str(error).startswith("Error writing"):  # as mediapy says
+            raise
+        raise OutputError(f"{output} could not be written as a video; make room on the disk.") from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,94 @@
+"""Tables of runs: on a page, in Markdown, in the terminal; and their histories as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from enerf_ns.evaluation.history import HistoryRow
+from enerf_ns.report.figures import SCORES
+from enerf_ns.report.trade_offs import seconds_to_reach
+
+NONE = "-"
+"""Cell of what there is not."""
+
+DIGITS = {"psnr": ".2f", "depth_rmse": ".3f", "ssim": ".3f", "lpips": ".3f"}
+"""How scores are written; .3f where nothing is said."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Words and numbers in rows."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    """What there is to know about it."""
+
+    def markdown(self) -> str:
+        """The table in Markdown, without its title."""
+        lines = [self.header, ["---"] * len(self.header), *self.rows]
+        cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
+        return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def score_cell(name: str, value: object) -> str:
+    """A score as text."""
+    return format(value, DIGITS.get(name, ".3f")) if isinstance(value, (int, float)) else NONE
+
+
+def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Sequence[float]) -> Table:
+    """Training time to reach each PSNR, for runs by name."""
+    rows = []
+    for name, history in runs:
+        cells = []
+        for target in targets:
+            found = seconds_to_reach(history, "psnr", target)
+            cells.append("not reached" if found is None else f"{'at most ' * found[1]}{found[0]:,.3g} s")
+        rows.append([name, *cells])
+    header = ["run", *(f"{target:g} dB" for target in targets)]
+    note = (
+        "Training time until PSNR is first as high, linear between the two rows of the history around it; "
+        "at most: the first row is as good already."
+    )
+    return Table("Time to reach a PSNR", header, rows, note)
+
+
+def step_parts(history: Sequence[HistoryRow]) -> dict[str, float]:
+    """Seconds of a step by what they are spent on: of each part the median over the rows that measured it."""
+    parts = dict.fromkeys(part for row in history for part in row.parts)
+    return {part: median(row.parts[part] for row in history if part in row.parts) for part in parts}
+
+
+def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
+    """Milliseconds and share of each part of a step, for runs by name."""
+    parts = list(dict.fromkeys(part for _, seconds in runs for part in seconds))
+    rows = []
+    for name, seconds in runs:
+        total = sum(seconds.values())
+        cells = [
+            f"{1e3 * seconds[part]:,.3g} ms ({seconds[part] / total:.0%})" if part in seconds and total else NONE
+            for part in parts
+        ]
+        rows.append([name, *cells, f"{1e3 * total:,.3g} ms"])
+    return Table("A training step", ["run", *parts, "in all"], rows, "Of each part the median over the history's rows.")
+
+
+def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
+    """Every row of every history; cells are empty where a row has no such score or loss."""
+    rows = [(name, row) for name, history in runs for row in history]
+    scores = list(dict.fromkeys([*SCORES, *(score for _, row in rows for score in row.scores)]))
+    losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
+    content = io.StringIO()
+    writer = csv.writer(content, lineterminator="\n")
+    writer.writerow(["run", "seconds", "step", *scores, "num_frames", *losses])
+    for name, row in rows:
+        values = [row.scores.get(score, "") for score in scores]
+        writer.writerow(
+            [name, row.seconds, row.step, *values, row.num_frames, *(row.losses.get(loss, "") for loss in losses)]
+        )
+    return content.getvalue()

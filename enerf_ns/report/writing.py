@@ -1,0 +1,401 @@
+"""The report of one or several runs: a page, Markdown, a CSV file, scores and pictures."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.files import write_together
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.evaluation.runs import Run, load
+from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
+from enerf_ns.report.pictures import camera_path, render_video, shown_numbers, side_by_side
+from enerf_ns.report.run_files import RunFiles, read_run, run_names
+from enerf_ns.report.tables import NONE, Table, history_csv, reach_table, score_cell, step_parts, step_table
+from enerf_ns.report.trade_offs import default_targets
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LARGEST_EMBEDDED_VIDEO = 8_000_000
+"""Bytes up to which a video is put into the page; a larger one is a file beside it."""
+
+CSV_FILE = "error-against-time.csv"
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How held-out frames are scored, where that is asked for; None: as every run is by default."""
+
+    protocol: str | None = None
+    """Name of the protocol."""
+    lpips: tuple[str, ...] | None = None
+    """Networks of LPIPS."""
+    crop: tuple[int, int, int, int] | None = None
+    """First and last row, first and last column of what is scored, pixels; the last ones excluded."""
+
+
+@dataclass
+class _Reported:
+    """A run, and what its report says of it."""
+
+    files: RunFiles
+    name: str = ""
+    prefix: str = ""
+    """What the names of the run's own files begin with."""
+    scores: dict[str, Any] = field(default_factory=dict)
+    step: int = 0
+    """Step whose field is scored."""
+    num_frames: int = 0
+    """Held-out frames that the scores are over."""
+    over_all_frames: bool = False
+    seconds: float | None = None
+    """Training time up to that step."""
+    events: int | None = None
+    picture: tuple[str, bytes] | None = None
+    """Name and content of the file with the pictures."""
+    video: bytes | None = None
+    captions: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What is left out or wrong, and what to do about it."""
+
+    @property
+    def protocol(self) -> str:
+        """How the scores are taken."""
+        return "log-affine-set" if self.files.config.pipeline.datamanager.supervision == "events" else "raw"
+
+    def entry(self) -> dict[str, Any]:
+        """What scores.json holds of the run."""
+        entry: dict[str, Any] = {"state": self.files.state, "step": self.step, "train_seconds": self.seconds}
+        entry |= {"events": self.events} if self.events is not None else {}
+        over = {"protocol": self.protocol, "num_frames": self.num_frames} if self.scores else {}
+        return entry | over | {"over_all_frames": self.over_all_frames} | self.scores
+
+
+def write_report(
+    runs: Sequence[Run | Path],
+    output_dir: Path,
+    reach: Sequence[float] | None = None,
+    scoring: Scoring = Scoring(),
+    video: bool = True,
+) -> dict[str, dict[str, Any]]:
+    """Write report.html, report.md, error-against-time.csv, scores.json, the plots, and of each run that can be loaded
+    side-by-side.png, camera_path.json and video.mp4; of several runs, the last three in a folder for each.
+
+    Scores are those of the last row of the run's history where it is at its end, else those of the newest whole
+    checkpoint; where neither is to be had, those of the last row that has some, over a few frames.
+
+    Args:
+        runs: Runs, or their folders or files config.yml, at least one. Those that cannot be read are a row that says
+            why.
+        output_dir: Made if it does not exist.
+        reach: PSNR (dB) whose time is told. None: some that the runs reach.
+        scoring: Another way of scoring, for which held-out frames are rendered anew.
+        video: Whether to render a flight past the held-out cameras.
+
+    Returns:
+        What scores.json holds: by the name of each run, its state, step, train_seconds, events, and scores.
+
+    Raises:
+        RecordingError: No run can be read.
+        FlagError: There is no such way of scoring.
+        OutputError: The folder cannot be written to, or the disk is full, or it lies within a recording.
+    """
+    if scoring != Scoring():
+        raise FlagError("--protocol, --lpips and --crop are not known to this version; leave them out.")
+    reported, unread = _read(runs)
+    for one in reported:
+        _check_outside(output_dir, one.files.config.data)
+    with _writing_to(output_dir):
+        output_dir.mkdir(parents=True, exist_ok=True)
+    loaded = {run.config_file.resolve(): run for run in runs if isinstance(run, Run)}
+    for one in reported:
+        _look_at(one, loaded.get(one.files.config_file), output_dir, scoring, video)
+    entries = {one.name: one.entry() for one in reported} | {name: {"state": fault} for name, fault in unread.items()}
+    files = _files(reported, unread, reach, entries)
+    with _writing_to(output_dir):
+        write_together(output_dir, files)
+    return entries
+
+
+def _read(runs: Sequence[Run | Path]) -> tuple[list[_Reported], dict[str, str]]:
+    """The runs, each once, and by their paths, why others cannot be read."""
+    if not runs:
+        raise FlagError("No run is given; give the folder of a run, or of several.")
+    read: dict[Path, RunFiles] = {}
+    unread: dict[str, str] = {}
+    for run in runs:
+        path = run.config_file if isinstance(run, Run) else run
+        try:
+            files = read_run(path)
+        except RecordingError as error:
+            unread[str(path)] = str(error)
+        else:
+            read[files.config_file] = files
+    if not read:
+        faults = list(unread.values())
+        raise RecordingError(faults[0] if len(faults) == 1 else "No run can be read: " + " ".join(faults))
+    reported = [_Reported(files, notes=list(files.notes)) for files in read.values()]
+    for one, name in zip(reported, run_names(list(read.values())), strict=True):
+        one.name = name
+    if len(reported) > 1:
+        prefixes: set[str] = set()
+        for number, one in enumerate(reported, 1):
+            plain = re.sub(r"[^A-Za-z0-9_.-]+", "-", one.name).strip("-.") or "run"
+            one.prefix = f"{plain if plain not in prefixes else f'{plain}-{number}'}/"
+            prefixes.add(one.prefix[:-1])
+    return reported, unread
+
+
+def _check_outside(output_dir: Path, recording: Path | None) -> None:
+    """Raises an OutputError where a folder lies within a recording."""
+    if recording is not None and output_dir.expanduser().resolve().is_relative_to(recording):
+        raise OutputError(
+            f"--output-dir {output_dir} lies within the recording {recording}, which is never written to; give a "
+            "folder elsewhere."
+        )
+
+
+@contextmanager
+def _writing_to(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"--output-dir {folder} could not be written to ({error.strerror}); give another folder."
+        ) from error
+
+
+def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring, video: bool) -> None:
+    """Fills in scores, pictures and video of a run, as far as they can be had."""
+    history = one.files.history
+    scored = next((row for row in reversed(history) if row.scores), None)
+    at_end = bool(scored and scored.final)
+    if scored:
+        one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
+        one.scores = dict.fromkeys(("psnr", "ssim", "lpips")) | scored.scores
+    else:
+        one.step = one.files.steps
+    if run is None:
+        run = _loaded(one)
+    if run is not None:
+        dataset = run.pipeline.datamanager.eval_dataset
+        one.events = len(index_events(dataset.recording))
+        shown = shown_numbers(len(dataset))
+        anew = not at_end or scoring != Scoring()
+        views, summary = held_out_views(run.pipeline, None if anew else shown)
+        stored = int(run.config.load_step or 0) + 1
+        if anew:
+            one.step, one.num_frames, one.over_all_frames = stored, len(views), True
+            one.scores = summary_scores(views, summary)
+            views = [views[number] for number in shown]
+        one.captions.append(
+            f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)}, counted from 0, after {stored:,} steps. "
+            f"Error: purple where the render is too bright, orange where it is too dark."
+        )
+        picture = _png(side_by_side(views, dataset.recording))
+        path = json.dumps(camera_path(dataset.cameras))
+        one.picture = f"{one.prefix}side-by-side.png", picture
+        with _writing_to(output_dir):
+            write_together(
+                output_dir,
+                {one.picture[0]: picture, f"{one.prefix}camera_path.json": path.encode()},
+            )
+            if video:
+                folder = output_dir / one.prefix
+                render_video(run, folder / "camera_path.json", folder / "video.mp4")
+                one.video = (folder / "video.mp4").read_bytes()
+    else:
+        _take_preview(one)
+    if history:
+        one.seconds = float(np.interp(one.step, [row.step for row in history], [row.seconds for row in history]))
+    elif run is not None and run.train_seconds is not None:
+        one.seconds = round(run.train_seconds, 1)
+
+
+def _loaded(one: _Reported) -> Run | None:
+    """The run, or None, and a note that says why."""
+    left_out = "so pictures, video and scores of the field as it is are left out"
+    recording = one.files.config.data
+    if recording is not None and not recording.exists():
+        one.notes.append(
+            f"The recording {recording} is not there any more, {left_out}: put it back, or a link to it (ln -s NEW "
+            f"{recording}), and call enerf report again."
+        )
+        return None
+    if not one.files.stored:
+        one.notes.append(f"No whole checkpoint is stored, {left_out}: wait for one, or train again.")
+        return None
+    try:
+        return load(one.files.config_file)
+    except RecordingError as error:
+        one.notes.append(f"{str(error).rstrip('.')}; {left_out}.")
+        return None
+
+
+def _take_preview(one: _Reported) -> None:
+    """Shows the newest picture that training left, where there is one."""
+    previews = sorted((one.files.folder / "previews").glob("step-*.png"))
+    if previews:
+        one.picture = f"{one.prefix}preview.png", previews[-1].read_bytes()
+        one.captions.append(f"The newest preview of the training, {previews[-1].name}.")
+
+
+def _files(
+    reported: Sequence[_Reported],
+    unread: dict[str, str],
+    reach: Sequence[float] | None,
+    entries: dict[str, dict[str, Any]],
+) -> dict[str, bytes]:
+    """All files of a report but those of each run."""
+    histories = [(one.name, one.files.history) for one in reported]
+    curves = [
+        Curve(one.name, one.files.history, one.seconds, _numbers(one.scores), one.over_all_frames) for one in reported
+    ]
+    targets = default_targets([history for _, history in histories], "psnr") if reach is None else list(reach)
+    steps = [(name, parts) for name, history in histories if (parts := step_parts(history))]
+    tables = [_scores_table(reported, unread), _runs_table(reported)]
+    if targets and any("psnr" in row.scores for _, history in histories for row in history):
+        tables.append(reach_table(histories, targets))
+    if steps:
+        tables.append(step_table(steps))
+    plots = {
+        "error-against-seconds.png": ("Error against training time", error_against("seconds", curves)),
+        "error-against-steps.png": ("Error against steps", error_against("step", curves)),
+        "work-precision.png": ("Error and the time it took", work_precision(curves)),
+        "step.png": ("What a training step spends its time on", step_breakdown(steps) if steps else None),
+    }
+    figures = {name: (title, _png(figure)) for name, (title, figure) in plots.items() if figure is not None}
+    return {
+        "report.html": _page(reported, tables, figures).encode(),
+        "report.md": _markdown(reported, tables, {name: title for name, (title, _) in figures.items()}).encode(),
+        CSV_FILE: history_csv(histories).encode(),
+        "scores.json": (json.dumps(entries, indent=2) + "\n").encode(),
+        **{name: content for name, (_, content) in figures.items()},
+        **{one.picture[0]: one.picture[1] for one in reported if one.picture},
+    }
+
+
+def _numbers(scores: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in scores.items() if isinstance(value, (int, float))}
+
+
+def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Table:
+    """Scores, time and state of each run; columns that no run has are left out."""
+    rows = [
+        {
+            "run": one.name,
+            "state": one.files.state,
+            "scored after": f"{one.step:,} steps" if one.scores else NONE,
+            "training": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
+            **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
+            "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.scores else NONE,
+            "protocol": one.protocol if one.scores else NONE,
+        }
+        for one in reported
+    ]
+    rows += [dict.fromkeys(rows[0], NONE) | {"run": path, "state": fault} for path, fault in unread.items()]
+    header = [name for name in rows[0] if any(row[name] != NONE for row in rows)]
+    note = "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored."
+    return Table("Scores", header, [[row[name] for name in header] for row in rows], note)
+
+
+def _runs_table(reported: Sequence[_Reported]) -> Table:
+    """What each run is."""
+    rows = []
+    for one in reported:
+        config = one.files.config
+        events = NONE if one.events is None else f"{one.events:,}"
+        recording = NONE if config.data is None else config.data.name
+        rows.append(
+            [one.name, config.method_name, one.files.learns_from, recording, events, str(config.machine.seed),
+             config.machine.device_type, str(one.files.folder)]
+        )  # fmt: skip
+    return Table("Runs", ["run", "method", "learns from", "recording", "events", "seed", "device", "folder"], rows)
+
+
+def _not_scored(one: _Reported) -> list[str]:
+    """A sentence for each score that some frames do not have."""
+    reasons: dict[str, dict[str, list[int]]] = one.scores.get("not_scored", {})
+    return [
+        f"No {name}" + (f" of frames {', '.join(map(str, numbers))}" if numbers else "") + f": {reason}."
+        for name, by_reason in reasons.items()
+        for reason, numbers in by_reason.items()
+    ]
+
+
+def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, tuple[str, bytes]]) -> str:
+    """One HTML file with all pictures in it, which loads nothing but videos that are too large for it."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    runs = []
+    for one in reported:
+        video = None
+        if one.video is not None:
+            small = len(one.video) <= LARGEST_EMBEDDED_VIDEO
+            video = _data_uri("video/mp4", one.video) if small else f"{one.prefix}video.mp4"
+        runs.append(
+            {
+                "title": one.name,
+                "picture": one.picture and _data_uri("image/png", one.picture[1]),
+                "captions": one.captions,
+                "notes": [*one.notes, *_not_scored(one)],
+                "video": video,
+            }
+        )
+    return templates.get_template("report.html").render(
+        title=_title(reported),
+        tables=tables,
+        figures=[{"title": title, "uri": _data_uri("image/png", content)} for title, content in figures.values()],
+        runs=runs,
+    )
+
+
+def _markdown(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, str]) -> str:
+    """The same in Markdown, with links to the files."""
+    parts = [f"# {_title(reported)}"]
+    for table in tables:
+        parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
+    for name, title in figures.items():
+        parts += [f"## {title}", f"![{title}]({name})"]
+    for one in reported:
+        parts.append(f"## {one.name}")
+        if one.picture:
+            parts.append(f"![held-out frames]({one.picture[0]})")
+        parts += [*one.captions, *one.notes, *_not_scored(one)]
+        if one.video is not None:
+            parts.append(f"[Video: brightness and depth, past the held-out cameras]({one.prefix}video.mp4)")
+    return "\n\n".join(parts) + "\n"
+
+
+def _title(reported: Sequence[_Reported]) -> str:
+    return reported[0].name if len(reported) == 1 else f"{len(reported)} runs"
+
+
+def _png(figure: Figure) -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
+
+
+def _data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
