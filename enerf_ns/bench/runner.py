@@ -121,10 +121,9 @@ class Bench:
         if settings.seeds < 1:
             raise FlagError(f"--seeds is {settings.seeds}, but must be at least 1.")
         if settings.threads is not None:
-            if not 1 <= settings.threads <= numba.config.NUMBA_NUM_THREADS:  # type: ignore[attr-defined]
-                raise FlagError(
-                    f"--threads is {settings.threads}, but must be from 1 to {numba.config.NUMBA_NUM_THREADS}."  # type: ignore[attr-defined]
-                )
+            most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+            if not 1 <= settings.threads <= most:
+                raise FlagError(f"--threads is {settings.threads}, but must be from 1 to {most}.")
             torch.set_num_threads(settings.threads)
             numba.set_num_threads(settings.threads)
         self.output_dir = settings.output_dir.expanduser().resolve()
