@@ -198,6 +198,7 @@ SEQUENCES: dict[str, Sequence] = {
         simulation={"key_frames": "unbounded.txt", "num_frames": 29},
         files={"unbounded.json": json.dumps(UNBOUNDED_SCENE), "unbounded.txt": UNBOUNDED_PATH},
     ),
+    "recording": Sequence(),
     "slider_depth": Sequence(),
     **{name: Sequence() for name in published.EDS if name != published.MEAN},
     "mocap-1d-trans": Sequence(preset="mocap-1d-trans"),
@@ -301,13 +302,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         recorded=("mocap-desk2", "mocap-desk2-6views"),
         notes=("The paper compares 60 with 6 views of mocap-desk2 by pictures; --data FOLDER names that recording.",),
     ),
-    "parts": Experiment(
-        "Numerical error of the parts, by which one sees what limits a result.",
-        ("events",),
-        ("shapes", "shake-carpet1"),
-        columns=("psnr",),
-        measures=("error_of_parts",),
-    ),
     "slider-depth": Experiment(
         "UZH's slider_depth (--data) beside Event-3DGS.",
         ("e2vid", "filter", "events"),
@@ -342,7 +336,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=("Here frames and time range are those of E-NeRF's configs; GPERT's are those of Robust e-NeRF.",),
     ),
     "design": Experiment(
-        "What the method was chosen against, one change each.",
+        "What the method was chosen against, one change each, on the demo's scene or on any recording.",
         (
             "events",
             "successor-pairs",
@@ -352,12 +346,17 @@ EXPERIMENTS: dict[str, Experiment] = {
             "no-distortion-loss",
             "view-direction",
             "16-levels-2^19",
+            "nerf-blurred",
+            "deblur",
+            "events+blurred",
+            "events+blurred-one-instant",
         ),
         ("shapes",),
+        recorded=("recording",),
         columns=("psnr", "ssim", "lpips", "correlation", "depth_rmse"),
     ),
     "left-out": Experiment(
-        "What the parts that a scene does not need would cost.",
+        "What the parts would cost that a grey, bounded, rectified scene does not need.",
         (
             "everything-forced-on",
             *(f"without-{part}" for part in LEFT_OUT),
@@ -365,6 +364,7 @@ EXPERIMENTS: dict[str, Experiment] = {
             "events",
         ),
         ("shapes",),
+        recorded=("recording",),
         columns=("psnr", "correlation", "depth_rmse", "ms_a_step", "megabytes_a_step"),
         measures=("memory",),
         notes=(

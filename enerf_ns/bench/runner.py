@@ -168,6 +168,7 @@ class Bench:
         """What is told of the experiment: all that its table is made of."""
         experiment, settings = self.experiment, self.settings
         weights = settings.reconstruction_weights
+        not_asked = {*experiment.rows} - {*self.rows, *self.left_out}
         return {
             "experiment": self.name,
             "sentence": experiment.sentence,
@@ -178,7 +179,10 @@ class Bench:
             "columns": experiment.columns,
             "protocols": experiment.protocols,
             "mean": experiment.mean,
-            "published": experiment.published,
+            "published": {
+                sequence: {row: scores for row, scores in rows.items() if row not in not_asked}
+                for sequence, rows in experiment.published.items()
+            },
             "source": experiment.source,
             "notes": experiment.notes,
             "reconstruction_weights": weights and weights.name,

@@ -77,7 +77,7 @@ def lines(results: Results) -> list[Line]:
                 line = Line(name, row, protocol, published=of_block.get(row, {}) if place == 0 else {})
                 _fill(line, [run for run in runs if run["row"] == row and run["sequence"] in block], len(block))
                 found.append(line)
-        others = [row for row in of_block if row not in rows and row not in results["left_out"]]
+        others = [row for row in of_block if row not in rows]
         found += [Line(name, row, results["protocols"][0], published=of_block[row]) for row in others]
     return found
 
