@@ -9,6 +9,7 @@ from typing import Annotated, Union  # tyro reads these annotations on Python 3.
 import tyro
 
 from enerf_ns.dataparsers.errors import UserError
+from enerf_ns.scripts.bench import Bench
 from enerf_ns.scripts.check_numerics import CheckNumerics
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.demo import Demo
@@ -18,6 +19,7 @@ from enerf_ns.scripts.report import Report
 from enerf_ns.scripts.simulate import Simulate
 
 Command = Union[  # noqa: UP007
+    Annotated[Bench, tyro.conf.subcommand(name="bench")],
     Annotated[CheckNumerics, tyro.conf.subcommand(name="check-numerics")],
     Annotated[Convert, tyro.conf.subcommand(name="convert")],
     Annotated[Demo, tyro.conf.subcommand(name="demo")],

@@ -1,0 +1,142 @@
+"""What a finished run tells of itself: scores of its held-out frames, depths, the cost of a step."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from enerf_ns.bench.experiments import NEAR
+from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.evaluation.metrics import depth_rmse
+from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.scores import NotScored, mean_scores
+from enerf_ns.evaluation.views import HeldOutView, held_out_views
+from enerf_ns.event_dataset import EventDataset
+
+REPEATS = 9
+"""How often each part of a step is timed; what is told is the median."""
+
+ProtocolScores = dict[str, dict[str, float]]
+"""Scores by protocol."""
+
+
+def evaluate(
+    run: Run, protocols: Sequence[str], measures: Sequence[str]
+) -> tuple[ProtocolScores, dict[str, NotScored]]:
+    """Scores of a run.
+
+    Args:
+        run: Trained.
+        protocols: Names of protocols; measures that have none stand with each.
+        measures: Names of `MEASURES`.
+
+    Returns:
+        Mean scores over the held-out frames that have them, with what the measures add, ms_a_step and, where depths are
+        known, depth_rmse_all_poses (metres); and what is left out of the means, and why. Both by protocol.
+    """
+    views, _ = held_out_views(run.pipeline)
+    added = _depth_rmse_all_poses(run.pipeline, views) | {"ms_a_step": milliseconds_a_step(run)}
+    for name in measures:
+        added |= MEASURES[name](run, views)
+    scores, not_scored = {}, {}
+    for protocol in protocols:
+        means, not_scored[protocol] = mean_scores(views)
+        scores[protocol] = means | added
+    return scores, not_scored
+
+
+def _depth_rmse_all_poses(pipeline: EnerfPipeline, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """Mean of the depth errors at all held-out and train poses."""
+    dataset = pipeline.datamanager.train_dataset
+    pairs = [(view.depth, view.recorded_depth) for view in views]
+    if dataset.are_frames and dataset.frames.depth_filenames is not None:
+        pairs += [(_depth(pipeline, dataset, index), dataset[index]["depth"]) for index in range(len(dataset))]
+    errors = [depth_rmse(depth, recorded) for depth, recorded in pairs if recorded is not None]
+    known = [error for error in errors if not isinstance(error, str)]
+    return {"depth_rmse_all_poses": float(np.mean(known))} if known else {}
+
+
+@torch.no_grad()
+def _depth(pipeline: EnerfPipeline, dataset: EventDataset, index: int) -> torch.Tensor:
+    """Rendered depth (height, width, 1) at the pose of a frame, in metres along the optical axis, on the CPU."""
+    pipeline.eval()
+    rays = dataset.cameras[index : index + 1].to(pipeline.device).generate_rays(camera_indices=0, keep_shape=True)
+    depth = pipeline.model.get_outputs_for_camera_ray_bundle(rays)["depth"] / rays.metadata["directions_norm"]
+    return (depth / pipeline.datamanager.train_dataparser_outputs.dataparser_scale).cpu()
+
+
+def _near_depth(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """Median depth error in metres of what is near in the unbounded scene."""
+    errors = []
+    for view in views:
+        assert view.recorded_depth is not None
+        near = (view.recorded_depth > 0) & (view.recorded_depth < NEAR[1])
+        errors.append((view.depth - view.recorded_depth)[near].abs())
+    return {"near_depth_error": float(torch.cat(errors).median())}
+
+
+def _memory(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """Megabytes that a step keeps for its backward pass, and the parameters with gradients and running means."""
+    kept: dict[int, int] = {}
+
+    def keep(tensor: torch.Tensor) -> torch.Tensor:
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    run.pipeline.train()
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        losses = run.pipeline.get_train_loss_dict(0)[1]
+    del losses
+    parameters = sum(parameter.nbytes for parameter in run.pipeline.model.parameters())
+    return {"megabytes_a_step": (sum(kept.values()) + 4 * parameters) / 1e6}
+
+
+def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """Percent of a training step that go into sampling events, their poses, rays but for these, frames' pixels, and the
+    rest."""
+    manager, sensor = run.pipeline.datamanager, run.pipeline.model.sensor
+    supervision = manager.config.supervision
+    parts = dict.fromkeys(("sample", "poses", "rays", "images"), 0.0)
+    for part, learnt_from in {"sample": "events", "images": "frames"}.items():
+        if learnt_from in supervision:
+            manager.config.supervision = learnt_from
+            parts[part] = _milliseconds(lambda: manager.next_batch(sensor), run)
+    manager.config.supervision = supervision
+    batch = manager.next_batch(sensor)
+    if batch.events is not None:
+        times = torch.cat([batch.events.start, batch.events.end])
+        parts["poses"] = _milliseconds(lambda: manager.event_camera.trajectory.poses(times), run)
+    parts["rays"] = _milliseconds(lambda: manager.rays(batch, sensor), run) - parts["poses"]
+    step = milliseconds_a_step(run)
+    shares = {part: 100.0 * value / step for part, value in parts.items()}
+    return shares | {"forward_and_backward": 100.0 - sum(shares.values())}
+
+
+def milliseconds_a_step(run: Run) -> float:
+    """Of the training of a run."""
+    assert run.train_seconds is not None
+    return 1e3 * run.train_seconds / run.config.max_num_iterations
+
+
+def _milliseconds(call: Callable[[], object], run: Run) -> float:
+    """Median wall time of a call, after one that warms up."""
+    times = []
+    for _ in range(REPEATS + 1):
+        start = time.perf_counter()
+        call()
+        if run.pipeline.device.type == "cuda":
+            torch.cuda.synchronize()
+        times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times[1:])
+
+
+MEASURES: dict[str, Callable[[Run, Sequence[HeldOutView]], dict[str, float]]] = {
+    "near_depth": _near_depth,
+    "memory": _memory,
+    "step": _step,
+}
+"""What is told beside scores, by name."""

@@ -1,0 +1,439 @@
+"""Runs the experiments of `enerf bench`: each row, sequence and seed once, and only what is not finished."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import hashlib
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import numba
+import torch
+
+import enerf_ns
+from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment
+from enerf_ns.bench.measures import evaluate
+from enerf_ns.bench.tables import csv_table, markdown
+from enerf_ns.dataparsers.errors import FlagError, OutputError
+from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.evaluation.history import read_history
+from enerf_ns.evaluation.runs import method_config, set_up, train
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
+
+FULL_SIZE = (640, 480)
+"""Width and height of the simulated sequences at scale 1, pixels."""
+
+WARM_UP, TIMED = 5, 20
+"""Steps that are left out, and steps that are timed, to find out how many fit a budget of seconds."""
+
+LATE = 1001
+"""Number of the first of them: as a run goes on, the proposal network learns at some steps only."""
+
+RESULT, LOG = "result.json", "log.txt"
+"""What a run's folder has besides the run itself."""
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """What is run, and for how long."""
+
+    data: Optional[Path] = None  # noqa: UP045
+    """Recording, or folder of recordings, of an experiment on real ones."""
+    budget: str = "120s"
+    """Training of each row: seconds, as in 120s, or steps, as in 600."""
+    scale: float = 0.25
+    """Size of the simulated sequences, of 640 x 480."""
+    seeds: int = 1
+    """Trainings of each row; scores are their means, with standard deviations."""
+    sequences: Tuple[str, ...] = ()  # noqa: UP006
+    """Some of the experiment's sequences. None: all."""
+    rows: Tuple[str, ...] = ()  # noqa: UP006
+    """Some of the experiment's rows. None: all."""
+    method: str = "enerf"
+    """Method of ns-train: enerf, or enerf-paper at full size on a GPU."""
+    reconstruction_weights: Optional[Path] = None  # noqa: UP045
+    """Weights of E2VID or FireNet, by which frames are reconstructed from events; without, that row is left out."""
+    threads: Optional[int] = None  # noqa: UP045
+    """Threads of the processor. None: as many as it has cores."""
+    output_dir: Path = Path("outputs/bench")
+    """Folder for the tables, recordings and runs; what is finished there is not run again."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of a row."""
+
+    row: str
+    sequence: str
+    seed: int
+
+
+class Bench:
+    """One experiment with its settings.
+
+    Args:
+        name: Of the experiment.
+        settings: Of the bench.
+
+    Raises:
+        FlagError: There is no such experiment, row or sequence; or a setting is out of its range.
+    """
+
+    def __init__(self, name: str, settings: BenchSettings):
+        if name not in EXPERIMENTS:
+            raise FlagError(f"There is no experiment {name}; choose one of {', '.join(EXPERIMENTS)}.")
+        self.name, self.settings, self.experiment = name, settings, EXPERIMENTS[name]
+        experiment: Experiment = self.experiment
+        of_data = settings.data is not None and bool(experiment.recorded)
+        if settings.data is not None and not experiment.recorded:
+            raise FlagError(f"--data changes nothing for {name}, whose sequences are simulated; leave it out.")
+        if settings.data is None and not experiment.sequences:
+            raise FlagError(f"enerf bench {name} needs --data: the folder of {', '.join(experiment.recorded)}.")
+        self.sequences = _some(
+            "sequences", settings.sequences, experiment.recorded if of_data else experiment.sequences
+        )
+        rows = _some("rows", settings.rows, experiment.rows)
+        self.left_out = {
+            row: "--reconstruction-weights names no file with the weights of a network"
+            for row in rows
+            if ROWS[row].reconstruction == "e2vid" and settings.reconstruction_weights is None
+        }
+        self.rows = tuple(row for row in rows if row not in self.left_out)
+        weights = settings.reconstruction_weights
+        if weights is not None and not weights.expanduser().is_file():
+            raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
+        parse_budget(settings.budget)
+        if not 0.0 < settings.scale <= 4.0:
+            raise FlagError(f"--scale is {settings.scale:g}, but must be above 0 and at most 4.")
+        if settings.seeds < 1:
+            raise FlagError(f"--seeds is {settings.seeds}, but must be at least 1.")
+        if settings.threads is not None:
+            most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+            if not 1 <= settings.threads <= most:
+                raise FlagError(f"--threads is {settings.threads}, but must be from 1 to {most}.")
+            torch.set_num_threads(settings.threads)
+            numba.set_num_threads(settings.threads)
+        self.output_dir = settings.output_dir.expanduser().resolve()
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All trainings, those on one recording after another."""
+        return [
+            Cell(row, sequence, seed)
+            for sequence in self.sequences
+            for seed in range(self.settings.seeds)
+            for row in self.rows
+        ]
+
+    def run(self) -> Iterator[tuple[Cell, dict[str, Any] | None]]:
+        """Trains and scores what is not finished, and writes the tables after each training.
+
+        Yields:
+            Each training that is begun, with None; then, as those that are finished already, with its result.
+
+        Raises:
+            OutputError: The output folder cannot be written to.
+            KeyboardInterrupt: Training was interrupted.
+        """
+        runs: list[dict[str, Any]] = []
+        for cell in self.cells:
+            result = self._finished(cell)
+            if result is None:
+                yield cell, None
+                result = self._attempt(cell)
+            runs.append(result)
+            results = self.results(runs)
+            for suffix, content in {
+                "json": json.dumps(results, indent=1) + "\n",
+                "md": markdown(results),
+                "csv": csv_table(results),
+            }.items():
+                self._write(self.output_dir / f"{self.name}.{suffix}", content)
+            yield cell, result
+
+    def results(self, runs: list[dict[str, Any]]) -> dict[str, Any]:
+        """What is told of the experiment: all that its table is made of."""
+        experiment, settings = self.experiment, self.settings
+        weights = settings.reconstruction_weights
+        not_asked = {*experiment.rows} - {*self.rows, *self.left_out}
+        return {
+            "experiment": self.name,
+            "sentence": experiment.sentence,
+            "command": self._command(),
+            "method": settings.method,
+            "budget": settings.budget,
+            "scale": settings.scale if self.sequences[0] in experiment.sequences else None,
+            "columns": experiment.columns,
+            "protocols": experiment.protocols,
+            "mean": experiment.mean,
+            "published": {
+                sequence: {row: scores for row, scores in rows.items() if row not in not_asked}
+                for sequence, rows in experiment.published.items()
+            },
+            "source": experiment.source,
+            "notes": experiment.notes,
+            "reconstruction_weights": weights and weights.name,
+            "left_out": self.left_out,
+            "runs": [{name: value for name, value in run.items() if name != "settings"} for run in runs],
+        }
+
+    def _command(self) -> str:
+        """The command that makes the same, wherever the data lie."""
+        words, default = ["enerf", "bench", self.name], BenchSettings()
+        for name, value in vars(self.settings).items():
+            if name in ("output_dir", "threads") or (
+                value == getattr(default, name) and name not in ("budget", "scale")
+            ):
+                continue
+            values = value if isinstance(value, tuple) else [value]
+            words.append(f"--{name.replace('_', '-')}")
+            words += [f"path/to/{value.name}" if isinstance(value, Path) else str(value) for value in values]
+        return shlex.join(words)
+
+    def _method(self, cell: Cell) -> str:
+        return ROWS[cell.row].method or self.settings.method
+
+    def _simulation(self, cell: Cell) -> dict[str, Any] | None:
+        """Settings of the simulation of a cell's recording; None where it is the user's."""
+        sequence = SEQUENCES[cell.sequence]
+        if sequence.scene is None:
+            return None
+        width, height = (max(1, round(self.settings.scale * side)) for side in FULL_SIZE)
+        return {"scene": sequence.scene, "width": width, "height": height, **sequence.simulation}
+
+    def _about(self, cell: Cell) -> dict[str, Any]:
+        """All that a result depends on, but for the version of the code."""
+        row, sequence, settings = ROWS[cell.row], SEQUENCES[cell.sequence], self.settings
+        simulation = self._simulation(cell)
+        weights = settings.reconstruction_weights if row.reconstruction == "e2vid" else None
+        about = {
+            "method": self._method(cell),
+            "changes": {**sequence.changes, **row.changes, "machine.seed": cell.seed},
+            "factors": row.factors,
+            "preset": sequence.preset,
+            "recording": str(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
+            "reconstruction": row.reconstruction,
+            "weights": weights and hashlib.sha256(weights.expanduser().read_bytes()).hexdigest(),
+            "budget": settings.budget,
+            "protocols": self.experiment.protocols,
+            "measures": self.experiment.measures,
+            "threads": torch.get_num_threads(),
+            "device": device_name(),
+        }
+        return json.loads(json.dumps(about))
+
+    def _folder(self, cell: Cell) -> Path:
+        """Folder of a cell's run, of the layout of Nerfstudio."""
+        name = f"{cell.row.replace('/', '-over-')}-seed-{cell.seed}-{_digest(self._about(cell))}"
+        return self.output_dir / "runs" / cell.sequence / self._method(cell) / name
+
+    def _finished(self, cell: Cell) -> dict[str, Any] | None:
+        """The result of a cell; None where it has none, or failed."""
+        try:
+            result = json.loads((self._folder(cell) / RESULT).read_text())
+        except (OSError, ValueError):
+            return None
+        return None if "failure" in result else result
+
+    def _attempt(self, cell: Cell) -> dict[str, Any]:
+        """Trains and scores; what becomes of it is stored."""
+        folder, about = self._folder(cell), self._about(cell)
+        result = {**asdict(cell), "settings": about, "version": code_version()}
+        result |= {"device": about["device"], "threads": about["threads"]}
+        shutil.rmtree(folder, ignore_errors=True)
+        self._write(folder / LOG, "")
+        try:
+            with (folder / LOG).open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+                result |= self._trained(cell, folder)
+        except SystemExit as end:
+            if end.code == 130:
+                raise KeyboardInterrupt from end
+            result["failure"] = str(end.code).removeprefix("enerf: ")
+        except Exception as error:  # whatever a row dies of, the others are run
+            result["failure"] = " ".join(str(error).split()) or type(error).__name__
+        self._write(folder / RESULT, json.dumps(result, indent=1) + "\n")
+        return result
+
+    def _trained(self, cell: Cell, folder: Path) -> dict[str, Any]:
+        """Seconds, steps and scores of a cell's run, which is in the folder afterwards."""
+        config = self._config(cell, folder)
+        config.max_num_iterations = steps_of(self.settings.budget, config)
+        config.steps_per_eval_image = config.steps_per_eval_batch = config.max_num_iterations + 1
+        run = train(config)
+        history = read_history(folder)
+        if history:
+            run = replace(run, train_seconds=history[-1].seconds)
+        assert run.train_seconds is not None
+        scores, not_scored = evaluate(run, self.experiment.protocols, self.experiment.measures)
+        result: dict[str, Any] = {
+            "steps": config.max_num_iterations,
+            "seconds": round(run.train_seconds, 2),
+            "scores": scores,
+        }
+        return result | ({"not_scored": not_scored} if any(not_scored.values()) else {})
+
+    def _config(self, cell: Cell, folder: Path) -> EnerfTrainerConfig:
+        row, sequence = ROWS[cell.row], SEQUENCES[cell.sequence]
+        changes = {**sequence.changes, **row.changes, "machine.seed": cell.seed, "preset": sequence.preset}
+        config = method_config(self._method(cell), self._recording(cell), self.output_dir / "runs", changes)
+        config.experiment_name, config.timestamp = cell.sequence, folder.name
+        if sequence.scene is not None and config.pipeline.model.view_direction is None:
+            config.pipeline.model.view_direction = False  # what is simulated is matt, so that all rows have one field
+        if row.factors:
+            resolved = config.resolved().pipeline
+            chosen = resolved.resolution.applied_to(resolved)
+            for path, factor in row.factors.items():
+                section, _, name = path.removeprefix("pipeline.").rpartition(".")
+                setattr(
+                    attrgetter(f"pipeline.{section}")(config),
+                    name,
+                    round(factor * attrgetter(f"{section}.{name}")(chosen)),
+                )
+        return config
+
+    def _recorded(self, cell: Cell) -> Path:
+        """Where the user has a recording."""
+        assert self.settings.data is not None
+        data = self.settings.data.expanduser().resolve()
+        return data / cell.sequence if (data / cell.sequence).is_dir() or len(self.sequences) > 1 else data
+
+    def _recording(self, cell: Cell) -> Path:
+        """The recording that a cell is trained on, made where it is not there."""
+        row, sequence, simulation = ROWS[cell.row], SEQUENCES[cell.sequence], self._simulation(cell)
+        if simulation is None:
+            recording = self._recorded(cell)
+        else:
+            stem = f"{Path(simulation['scene']).stem}-{simulation['width']}x{simulation['height']}"
+            recording = self.output_dir / "recordings" / f"{stem}-{_digest([simulation, sequence.files])}"
+            with _made_whole(recording) as folder:
+                if folder is not None:
+                    given = {
+                        name: str(self._file(value, sequence.files[value])) if value in sequence.files else value
+                        for name, value in simulation.items()
+                    }
+                    if "key_frames" in given:
+                        given["key_frames"] = Path(given["key_frames"])
+                    simulate(SimulationSettings(**given), folder)
+        if row.reconstruction is None:
+            return recording
+        from enerf_ns.reconstruction.reconstruction import reconstruct  # pyright: ignore[reportMissingImports]
+
+        weights = self.settings.reconstruction_weights if row.reconstruction == "e2vid" else None
+        about = self._about(cell)
+        of = _digest([about["recording"], row.reconstruction, about["weights"]])
+        frames = self.output_dir / "recordings" / f"{cell.sequence}-{row.reconstruction}-{of}"
+        with _made_whole(frames) as folder:
+            if folder is not None:
+                reconstruct(recording, folder, weights and weights.expanduser())
+        return frames
+
+    def _file(self, name: str, content: str) -> Path:
+        path = self.output_dir / "recordings" / name
+        self._write(path, content)
+        return path
+
+    def _write(self, path: Path, content: str) -> None:
+        try:
+            write_whole(path, content)
+        except OSError as error:
+            raise OutputError(
+                f"{path} could not be written ({error.strerror}); make room, or give another --output-dir."
+            ) from error
+
+
+def parse_budget(budget: str) -> tuple[float, bool]:
+    """Amount of a budget, and whether it is in seconds, not steps.
+
+    Raises:
+        FlagError: It is neither.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)(s?)", budget)
+    amount, in_seconds = (float(found[1]), found[2] == "s") if found else (0.0, False)
+    if amount <= 0.0 or not (in_seconds or amount.is_integer()):
+        raise FlagError(f"--budget is {budget}, but seconds, as in 120s, or steps, as in 600, were expected.")
+    return amount, in_seconds
+
+
+def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
+    """Steps that a run may take, where need be measured with a short one that is thrown away."""
+    amount, in_seconds = parse_budget(budget)
+    if not in_seconds:
+        return int(amount)
+    with tempfile.TemporaryDirectory() as folder:
+        trial = copy.deepcopy(config)
+        trial.output_dir, trial.max_num_iterations = Path(folder), LATE + WARM_UP + TIMED
+        trainer = set_up(trial)
+        trainer.pipeline.train()
+        start = 0.0
+        for step in range(LATE, LATE + WARM_UP + TIMED):
+            if step == LATE + WARM_UP:
+                start = time.perf_counter()
+            trainer.train_iteration(step)
+            for callback in trainer.callbacks:
+                callback.func(step)
+            if trainer.pipeline.device.type == "cuda":
+                torch.cuda.synchronize()
+        return max(1, round(amount * TIMED / (time.perf_counter() - start)))
+
+
+def code_version() -> str:
+    """Version of the package, and where it runs from its repository the commit, -dirty if that was changed."""
+    root = Path(enerf_ns.__file__).parents[1]
+
+    def git(*arguments: str) -> str:
+        asked = subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True, check=True)
+        return asked.stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root.resolve():
+            return enerf_ns.__version__
+        return f"{enerf_ns.__version__}+{git('describe', '--always', '--dirty', '--abbrev=10', '--exclude=*')}"
+    except (OSError, subprocess.CalledProcessError):
+        return enerf_ns.__version__
+
+
+def device_name() -> str:
+    """The device that methods train on by default."""
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+
+
+def _some(flag: str, chosen: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of what is known that a flag names, in their order; all where it names none.
+
+    Raises:
+        FlagError: It names one that is not known.
+    """
+    unknown = [name for name in chosen if name not in known]
+    if unknown:
+        raise FlagError(f"--{flag} {' '.join(unknown)} is not of this experiment; choose of {', '.join(known)}.")
+    return tuple(name for name in known if not chosen or name in chosen)
+
+
+def _digest(about: Any) -> str:
+    """A short name for settings."""
+    return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:10]
+
+
+@contextlib.contextmanager
+def _made_whole(folder: Path) -> Iterator[Path | None]:
+    """A new folder beside one that is to be made, which it becomes at the end; None where that one is there."""
+    if folder.exists():
+        yield None
+        return
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    yield partial
+    partial.rename(folder)

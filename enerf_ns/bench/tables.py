@@ -1,0 +1,221 @@
+"""Tables of an experiment's results, as functions of its result file alone: for the terminal, Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+from statistics import mean, stdev
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from enerf_ns.bench.published import MEAN
+
+Results = dict[str, Any]
+"""What a result file holds (`Bench.results`)."""
+
+DIGITS = {
+    "psnr": 2,
+    "depth_rmse_all_poses": 2,
+    "ms_a_step": 0,
+    "megabytes_a_step": 1,
+    **dict.fromkeys(("sample", "poses", "rays", "images", "forward_and_backward"), 2),
+}
+"""Digits behind the point, where they are not 3."""
+
+TITLES = {
+    "psnr": "PSNR, dB",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "lpips_vgg": "LPIPS (VGG)",
+    "depth_rmse": "depth RMSE, m",
+    "depth_rmse_all_poses": "depth RMSE, m",
+    "near_depth_error": "median depth error, m",
+    "ms_a_step": "ms a step",
+    "megabytes_a_step": "MB a step",
+    "forward_and_backward": "forward and backward",
+}
+"""Names of scores for a reader, where they are not their own."""
+
+LOWER_IS_BETTER = ("lpips", "lpips_vgg", "depth_rmse", "depth_rmse_all_poses", "near_depth_error", "ms_a_step")
+
+
+@dataclass
+class Line:
+    """One line of a table."""
+
+    sequence: str
+    row: str
+    protocol: str
+    scores: dict[str, list[float]] = field(default_factory=dict)
+    """By name, one a seed."""
+    published: dict[str, float] = field(default_factory=dict)
+    seconds: list[float] = field(default_factory=list)
+    """Of training, one a run."""
+    steps: list[int] = field(default_factory=list)
+
+
+def lines(results: Results) -> list[Line]:
+    """The lines of the table: by sequence, rows in their order, then what others published alone."""
+    runs, published = results["runs"], results["published"]
+    sequences = list(dict.fromkeys(run["sequence"] for run in runs))
+    rows = list(dict.fromkeys(run["row"] for run in runs))
+    blocks = [] if results["mean"] else [[sequence] for sequence in sequences]
+    if results["mean"] or MEAN in published:
+        blocks.append(sequences)
+    found = []
+    for number, block in enumerate(blocks):
+        is_mean = results["mean"] or number == len(sequences)
+        name = MEAN if is_mean else block[0]
+        of_block = published.get(name, {})
+        for row in rows:
+            for place, protocol in enumerate(results["protocols"]):
+                line = Line(name, row, protocol, published=of_block.get(row, {}) if place == 0 else {})
+                _fill(line, [run for run in runs if run["row"] == row and run["sequence"] in block], len(block))
+                found.append(line)
+        others = [row for row in of_block if row not in rows]
+        found += [Line(name, row, results["protocols"][0], published=of_block[row]) for row in others]
+    return found
+
+
+def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
+    """Adds the scores of each seed that has all sequences, their mean over these."""
+    for seed in dict.fromkeys(run["seed"] for run in runs):
+        done = [run for run in runs if run["seed"] == seed and "failure" not in run]
+        if len(done) < num_sequences:
+            continue
+        line.seconds += [run["seconds"] for run in done]
+        line.steps += [run["steps"] for run in done]
+        scores = [run["scores"][line.protocol] for run in done]
+        for name in scores[0]:
+            values = [of_run[name] for of_run in scores if of_run.get(name) is not None]
+            if len(values) == num_sequences:
+                line.scores.setdefault(name, []).append(mean(values))
+
+
+def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
+    """Head of the table, and its lines."""
+    table, columns = lines(results), results["columns"]
+    theirs = [name for name in columns if any(name in line.published for line in table)]
+    several = len(results["protocols"]) > 1
+    source = results["source"]
+    head = ["sequence", "row", *(["protocol"] if several else []), *(TITLES.get(name, name) for name in columns)]
+    head += ["training, s", "steps", *(f"{source}: {TITLES.get(name, name)}" for name in theirs)]
+    content = []
+    for line in table:
+        cells = [line.sequence, line.row, *([line.protocol] if several else [])]
+        cells += [_score(name, line.scores.get(name, [])) for name in columns]
+        cells += [f"{mean(line.seconds):.0f}" if line.seconds else "-"]
+        cells += [f"{mean(line.steps):.0f}" if line.steps else "-"]
+        cells += [_published(name, line.published[name]) if name in line.published else "-" for name in theirs]
+        content.append(cells)
+    return head, content
+
+
+def _score(name: str, values: list[float]) -> str:
+    if not values:
+        return "-"
+    digits = DIGITS.get(name, 3)
+    spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{mean(values):.{digits}f}{spread}"
+
+
+def _published(name: str, value: float) -> str:
+    """As it was printed: with two digits at least, where ours have some."""
+    digits = len(f"{value:g}".partition(".")[2])
+    return f"{value:.{max(digits, 2) if DIGITS.get(name, 3) else 0}f}"
+
+
+def disagreements(results: Results) -> list[str] | None:
+    """Where one row is better than another here and worse as published, a sentence each; None where nothing can be
+    compared."""
+    name = results["columns"][0]
+    lower = name in LOWER_IS_BETTER
+    compared, found = 0, []
+    both = [line for line in lines(results) if name in line.published and line.scores.get(name)]
+    for one, other in combinations(both, 2):
+        if one.sequence != other.sequence:
+            continue
+        compared += 1
+        ours = mean(one.scores[name]) - mean(other.scores[name])
+        theirs = one.published[name] - other.published[name]
+        if ours * theirs >= 0:
+            continue
+        better, worse = (one, other) if (ours > 0) != lower else (other, one)
+        spread = sum(stdev(line.scores[name]) ** 2 for line in (one, other) if len(line.scores[name]) > 1) ** 0.5
+        values = [_score(name, [mean(line.scores[name])]) for line in (better, worse)]
+        in_theirs = [_published(name, line.published[name]) for line in (better, worse)]
+        found.append(
+            f"{one.sequence}: {better.row} is better than {worse.row} here ({' and '.join(values)}), and worse in "
+            f"{results['source']} ({' and '.join(in_theirs)})"
+            + (", by less than the seeds differ." if abs(ours) < spread else ".")
+        )
+    return found if compared else None
+
+
+def remarks(results: Results) -> Iterator[str]:
+    """What belongs to the table, a sentence each: how it was made, what is missing, where the order is another."""
+    runs, name = results["runs"], TITLES.get(results["columns"][0], results["columns"][0]).partition(",")[0]
+    seeds = 1 + max((run["seed"] for run in runs), default=0)
+    size = "" if results["scale"] is None else f" at scale {results['scale']:g} of 640 x 480"
+    budget = results["budget"] if results["budget"].endswith("s") else f"{results['budget']} steps"
+    spread = f", mean ± standard deviation of {seeds} seeds" if seeds > 1 else ", one seed"
+    for device, threads, version in sorted({(run["device"], run["threads"], run["version"]) for run in runs}):
+        where = f"{threads} CPU thread{'s' * (threads > 1)}" if device == "CPU" else device
+        yield (
+            f"Method {results['method']}, {budget} of training a row{size}{spread}; {where}; version {version}; "
+            f"protocol {', '.join(results['protocols'])}."
+        )
+    if len({run["version"] for run in runs}) > 1:
+        yield "Rows come from more than one version of the code."
+    yield from results["notes"]
+    if results["reconstruction_weights"] and any(run["row"] == "e2vid" for run in runs):
+        yield f"e2vid reconstructs with the weights {results['reconstruction_weights']}."
+    for row, why in results["left_out"].items():
+        yield f"{row} is left out: {why}."
+    for run in runs:
+        if "failure" in run:
+            yield f"{run['sequence']}, {run['row']}, seed {run['seed']} failed: {run['failure'].rstrip('.')}."
+    found = disagreements(results)
+    if found == []:
+        yield f"By {name}, the rows that are in {results['source']}, too, are in the same order there."
+    if found:
+        yield f"By {name}, not all rows are in the order of {results['source']}:"
+        yield from found
+
+
+def markdown(results: Results) -> str:
+    """The command, the table and what belongs to it."""
+    head, content = _cells(results)
+    table = [head, ["---"] * len(head), *content]
+    printed = "\n".join(f"| {' | '.join(cells)} |" for cells in table)
+    return f"    {results['command']}\n\n{printed}\n\n" + "".join(f"* {remark}\n" for remark in remarks(results))
+
+
+def rich_table(results: Results) -> Table:
+    """The table for the terminal."""
+    head, content = _cells(results)
+    table = Table(title=f"{results['experiment']}: {results['sentence']}", title_justify="left")
+    for number, name in enumerate(head):
+        table.add_column(name, justify="left" if number < 2 else "right")
+    for cells in content:
+        table.add_row(*map(escape, cells))
+    return table
+
+
+def csv_table(results: Results) -> str:
+    """A line for each run and protocol, with all its scores."""
+    runs = [run for run in results["runs"] if "failure" not in run]
+    names = dict.fromkeys(name for run in runs for scores in run["scores"].values() for name in scores)
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["sequence", "row", "seed", "protocol", "steps", "seconds", *names])
+    for run in runs:
+        for protocol, scores in run["scores"].items():
+            about = [run["sequence"], run["row"], run["seed"], protocol, run["steps"], run["seconds"]]
+            writer.writerow([*about, *(scores.get(name, "") for name in names)])
+    return table.getvalue()

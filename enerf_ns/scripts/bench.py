@@ -1,0 +1,66 @@
+"""`enerf bench`: the tables and figures of the paper, and more, each from one command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Optional  # tyro reads these annotations on Python 3.10
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from enerf_ns.bench.experiments import EXPERIMENTS
+from enerf_ns.bench.runner import Bench as Runs
+from enerf_ns.bench.runner import BenchSettings
+from enerf_ns.bench.tables import remarks, rich_table
+
+CONSOLE = Console(width=140)
+
+
+@dataclass
+class Bench:
+    """Train and score all rows of an experiment, and print their table; without one, list the experiments."""
+
+    experiment: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
+    """Which table: its name, as in the list."""
+    settings: Annotated[BenchSettings, tyro.conf.arg(name="")] = field(default_factory=BenchSettings)
+
+    def main(self) -> None:
+        if self.experiment is None:
+            CONSOLE.print(_experiments())
+            return
+        bench = Runs(self.experiment, self.settings)
+        numbers = {cell: number for number, cell in enumerate(bench.cells, 1)}
+        results = []
+        for cell, result in bench.run():
+            name = f"[{numbers[cell]}/{len(numbers)}] {cell.sequence}, {cell.row}, seed {cell.seed}"
+            if result is None:
+                CONSOLE.print(f"{name} …", markup=False, highlight=False)
+                continue
+            results.append(result)
+            told = result.get("failure") or f"{result['seconds']:.0f} s, {result['steps']} steps"
+            CONSOLE.print(f"{name}: {told}", markup=False, highlight=False, soft_wrap=True)
+        told = bench.results(results)
+        CONSOLE.print(rich_table(told))
+        for remark in remarks(told):
+            CONSOLE.print(f"* {remark}", markup=False, highlight=False, soft_wrap=True)
+        where = bench.output_dir / self.experiment
+        CONSOLE.print(f"The table is in {where}.md, .json and .csv", markup=False, highlight=False, soft_wrap=True)
+
+
+def _experiments() -> Table:
+    """What there is, and how many trainings each takes."""
+    table = Table(title="enerf bench EXPERIMENT", title_justify="left", caption_justify="left", caption=DURATION)
+    for column in ("experiment", "what is compared", "trainings", "on"):
+        table.add_column(column)
+    for name, experiment in EXPERIMENTS.items():
+        recordings = "simulated" if experiment.sequences else ""
+        if experiment.recorded:
+            recordings = f"{recordings}, or --data" if recordings else "--data"
+        trainings = len(experiment.rows) * len(experiment.sequences or experiment.recorded)
+        table.add_row(name, experiment.sentence, str(trainings), recordings)
+    return table
+
+
+DURATION = "A training takes its --budget, 120 s by default, and some time for scores. Sequences are simulated once."
+"""Roughly how long it takes."""

@@ -1,0 +1,307 @@
+"""Experiments that are run, stopped, killed, run on, and run again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import SMALL
+
+from enerf_ns.bench import runner
+from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
+from enerf_ns.bench.measures import evaluate, milliseconds_a_step
+from enerf_ns.bench.runner import Bench, BenchSettings, parse_budget, steps_of
+from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.enerf_trainer import EnerfTrainer
+from enerf_ns.evaluation.metrics import depth_rmse
+from enerf_ns.evaluation.runs import load, method_config
+from enerf_ns.evaluation.views import held_out_views
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def simulated(finished: Path, tmp_path: Path) -> Path:
+    """An output folder with the recording alone."""
+    shutil.copytree(finished / "recordings", tmp_path / "recordings")
+    return tmp_path
+
+
+def bench(folder: Path, name: str = "design", **changes: Any) -> Bench:
+    return Bench(name, BenchSettings(**{**SMALL, "output_dir": folder, **changes}))
+
+
+def finish(folder: Path, **changes: Any) -> list[str]:
+    """Runs to the end; names of the rows that were begun."""
+    return [cell.row for cell, result in bench(folder, **changes).run() if result is None]
+
+
+def table(folder: Path) -> list[dict[str, Any]]:
+    """Results but for what is of the clock."""
+    runs = json.loads((folder / "design.json").read_text())["runs"]
+    for run in runs:
+        run.pop("seconds")
+        for scores in run["scores"].values():
+            scores.pop("ms_a_step")
+    return runs
+
+
+def test_what_is_finished_is_not_run_again_and_gives_the_same_tables(finished: Path, tmp_path: Path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    written = {file: file.read_bytes() for file in folder.glob("design.*")}
+    for file in written:
+        file.unlink()
+    assert finish(folder) == []
+    assert {file: file.read_bytes() for file in folder.glob("design.*")} == written
+    assert {file.suffix for file in written} == {".md", ".json", ".csv"}
+
+
+def test_a_result_says_what_it_was_made_of(finished: Path):
+    for file in finished.glob("runs/*/*/*/result.json"):
+        result = json.loads(file.read_text())
+        assert (file.parent / "config.yml").exists() and (file.parent / "log.txt").stat().st_size
+        assert result["steps"] == 2 and result["seconds"] > 0 and result["threads"] == 1
+        assert result["version"] == runner.code_version() and result["device"] == runner.device_name()
+        assert result["settings"]["changes"]["machine.seed"] == result["seed"] == 0
+        assert set(result["scores"]) == {"log-affine-set"}
+    assert len(list(finished.glob("runs/*/*/*/result.json"))) == 2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"budget": "3"}, {"scale": 0.06}, {"seeds": 2}, {"method": "enerf-paper"}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_what_was_made_with_other_settings_is_run_again(finished: Path, changes: dict[str, Any]):
+    """The last cell is of another seed where there are more."""
+    run = bench(finished, **changes)
+    assert not run._folder(run.cells[-1]).exists()
+    assert bench(finished)._folder(run.cells[0]).exists()
+
+
+def test_a_bench_that_is_stopped_between_rows_and_inside_of_one_ends_with_the_same_table(
+    finished: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for _, result in bench(simulated).run():  # between rows
+        if result is not None:
+            break
+    train_iteration = EnerfTrainer.train_iteration
+
+    def interrupted(self: EnerfTrainer, step: int):
+        os.kill(os.getpid(), signal.SIGINT)
+        return train_iteration(self, step)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(EnerfTrainer, "train_iteration", interrupted)
+        with pytest.raises(KeyboardInterrupt):  # inside of the second
+            finish(simulated)
+    assert [run["row"] for run in table(simulated)] == ["events"]
+    assert finish(simulated) == ["uniform-samples"]
+    assert table(simulated) == table(finished)
+
+
+@pytest.mark.slow
+def test_a_bench_that_is_killed_between_rows_and_inside_of_them_ends_with_the_same_table(
+    finished: Path, tmp_path: Path
+):
+    """Killed while it simulates, while the first row is trained, and once that is finished."""
+    command = [sys.executable, "-c", "from enerf_ns.scripts.cli import entrypoint; entrypoint()", "bench", "design"]
+    command += ["--budget", "2", "--scale", "0.05", "--threads", "1", "--output-dir", str(tmp_path)]
+    command += ["--rows", *SMALL["rows"]]
+    for pattern in ("recordings/.*/*", "runs/*/*/*/config.yml", "runs/*/*/*/result.json"):
+        process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
+        while not list(tmp_path.glob(pattern)):
+            assert process.poll() is None, f"it ended before there was {pattern}"
+            time.sleep(0.002)
+        process.kill()
+        process.wait()
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert table(tmp_path) == table(finished)
+
+
+def test_a_row_that_fails_says_why_is_tried_again_and_stops_no_other(
+    finished: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
+):
+    with monkeypatch.context() as broken:
+        broken.setitem(ROWS, "events", Row({"pipeline.model.nothing": 1}))
+        assert finish(simulated) == ["events", "uniform-samples"]
+        assert finish(simulated) == ["events"]
+        sentence = "The method enerf has no setting pipeline.model.nothing"
+        failed, scored = json.loads((simulated / "design.json").read_text())["runs"]
+        assert failed["failure"].startswith(sentence) and "failure" not in scored
+        assert f"* shapes, events, seed 0 failed: {sentence}" in (simulated / "design.md").read_text()
+    assert finish(simulated) == ["events"]
+    assert table(simulated) == table(finished)
+
+
+def test_a_recording_that_is_not_there_fails_its_rows_in_a_sentence(tmp_path: Path):
+    assert finish(tmp_path, name="slider-depth", data=tmp_path / "nowhere", rows=("events",)) == ["events"]
+    (run,) = json.loads((tmp_path / "slider-depth.json").read_text())["runs"]
+    assert "nowhere" in run["failure"] and run["failure"].count(". ") == 0
+
+
+def test_a_simulation_that_was_cut_short_is_not_used(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(settings: Any, output_dir: Path) -> None:
+        output_dir.mkdir(parents=True)
+        (output_dir / "poses_all.txt").write_text("")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(runner, "simulate", full)
+        finish(tmp_path, rows=("events",))
+        assert "No space left" in (tmp_path / "design.md").read_text()
+    finish(tmp_path, rows=("events",))
+    assert table(tmp_path) == table(finished)[:1]
+
+
+def test_experiments_share_the_runs_of_rows_and_sequences_that_they_share():
+    def folders(name: str) -> set[Path]:
+        run = Bench(name, BenchSettings())
+        return {run._folder(cell) for cell in run.cells}
+
+    shared = folders("spiral") | folders("shake")
+    assert folders("depth") < shared and len(folders("views") & shared) == 2
+    assert len(folders("ablation") & shared) == 5
+
+
+def test_all_rows_on_a_recording_have_one_field_though_their_preset_leaves_gloss_open():
+    run = Bench("spiral", BenchSettings(method="enerf"))
+    for cell in run.cells:
+        row = ROWS[cell.row]
+        if row.reconstruction is None and "pipeline.datamanager.exposure_samples" not in row.changes:
+            run._recording = lambda _: Path("recording")  # type: ignore[method-assign]
+            assert run._config(cell, Path("run")).pipeline.model.view_direction is False
+
+
+def test_settings_that_are_multiplied_are_those_that_were_chosen(finished: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(ROWS, "events", Row(factors={"pipeline.model.num_levels": 1.5, "pipeline.model.max_res": 12}))
+    run = bench(finished)
+    (cell, _) = run.cells
+    found = run._config(cell, Path("run")).pipeline.model
+    recording = run._recording(cell)
+    chosen = method_config("enerf", recording, finished).resolved().pipeline.resolution.values
+    assert found.num_levels == round(1.5 * chosen["model.num_levels"])
+    assert found.max_res == 12 * chosen["model.max_res"]
+
+
+def test_a_scene_of_its_own_is_written_and_simulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    unbounded = SEQUENCES["unbounded"]
+    short = {**unbounded.files, "unbounded.txt": "0 0 0 0 0 2 0\n0.05 0.02 0 0 0 2 0\n"}
+    simulation = {**unbounded.simulation, "num_frames": 11}
+    sequence = Sequence(unbounded.scene, changes=unbounded.changes, simulation=simulation, files=short)
+    monkeypatch.setitem(SEQUENCES, "unbounded", sequence)
+    assert finish(tmp_path, name="unbounded", rows=("no-contraction",)) == ["no-contraction"]
+    (run,) = json.loads((tmp_path / "unbounded.json").read_text())["runs"]
+    assert run["scores"]["log-affine-set"]["near_depth_error"] > 0
+
+
+def test_measures_of_a_run(finished: Path):
+    """Depths at all poses against those of `held_out_views`, once for each half of the frames."""
+    (folder,) = finished.glob("runs/shapes/enerf/events-*")
+    run = runner.replace(load(folder / "config.yml"), train_seconds=3.0)
+    assert milliseconds_a_step(run) == 1500.0
+    scores, _ = evaluate(run, ["log-affine-set"], ["memory", "step"])
+    found = scores["log-affine-set"]
+    manager = run.pipeline.datamanager
+    views = held_out_views(run.pipeline)[0]
+    manager.eval_dataset = manager.train_dataset
+    views += held_out_views(run.pipeline)[0]
+    errors = [depth_rmse(view.depth, view.recorded_depth) for view in views if view.recorded_depth is not None]
+    assert len(errors) == 41  # frames of the recording
+    assert found["depth_rmse_all_poses"] == pytest.approx(sum(map(float, errors)) / len(errors), rel=1e-5)
+    parameters = sum(parameter.nbytes for parameter in run.pipeline.model.parameters())
+    assert found["megabytes_a_step"] > 4 * parameters / 1e6
+    parts = [found[name] for name in ("sample", "poses", "rays", "images", "forward_and_backward")]
+    assert sum(parts) == pytest.approx(100.0) and found["images"] == 0.0 and min(parts[:3]) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("budget", "expected"), [("120s", (120.0, True)), ("0.5s", (0.5, True)), ("600", (600.0, False))]
+)
+def test_a_budget_is_seconds_or_steps(budget: str, expected: tuple[float, bool]):
+    assert parse_budget(budget) == expected
+
+
+@pytest.mark.parametrize("budget", ["", "0", "0s", "1.5", "-3", "2m", "s", "1e3", "inf"])
+def test_a_budget_that_is_neither_is_told(budget: str):
+    with pytest.raises(FlagError, match="--budget"):
+        parse_budget(budget)
+
+
+def test_seconds_become_as_many_steps_as_fit(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With a clock that goes on by a tenth of a second a step."""
+    steps = 0
+    train_iteration = EnerfTrainer.train_iteration
+
+    def counted(self: EnerfTrainer, step: int):
+        nonlocal steps
+        steps += 1
+        return train_iteration(self, step)
+
+    monkeypatch.setattr(EnerfTrainer, "train_iteration", counted)
+    monkeypatch.setattr(runner.time, "perf_counter", lambda: 0.1 * steps)
+    run = bench(finished)
+    config = run._config(run.cells[0], tmp_path)
+    assert steps_of("50s", config) == 500 and steps_of("7", config) == 7
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "sentence"),
+    [
+        ("nothing", {}, "There is no experiment nothing; choose one of spiral, "),
+        ("design", {"rows": ("events", "nothing")}, "--rows nothing is not of this experiment; choose of events, "),
+        ("design", {"sequences": ("spiral1",)}, "--sequences spiral1 is not of this experiment; choose of shapes"),
+        ("shake", {"data": Path("x")}, "--data changes nothing for shake"),
+        ("eds", {}, "enerf bench eds needs --data"),
+        ("design", {"scale": 0.0}, "--scale is 0"),
+        ("design", {"seeds": 0}, "--seeds is 0"),
+        ("design", {"threads": 10**6}, "--threads is 1000000"),
+        ("spiral", {"reconstruction_weights": Path("no.pth")}, "--reconstruction-weights no.pth does not exist"),
+    ],
+)
+def test_settings_that_cannot_be_are_told_before_anything_starts(name, changes, sentence, tmp_path: Path):
+    with pytest.raises(FlagError) as told:
+        Bench(name, BenchSettings(output_dir=tmp_path, **changes))
+    assert str(told.value).startswith(sentence)
+    assert not list(tmp_path.iterdir())
+
+
+def test_reconstructed_frames_need_weights_or_are_left_out(tmp_path: Path):
+    weights = tmp_path / "weights.pth"
+    weights.write_bytes(b"weights")
+    with_weights, without = (Bench("shake", BenchSettings(reconstruction_weights=file)) for file in (weights, None))
+    assert "e2vid" in with_weights.rows and "e2vid" not in without.rows and "filter" in without.rows
+    assert set(without.results([])["left_out"]) == {"e2vid"}
+    assert with_weights.results([])["reconstruction_weights"] == "weights.pth"
+
+
+def test_the_command_names_no_place_of_this_machine(tmp_path: Path):
+    settings = BenchSettings(data=tmp_path / "slider", seeds=2, rows=("events",), output_dir=tmp_path)
+    assert Bench("slider-depth", settings).results([])["command"] == (
+        "enerf bench slider-depth --data path/to/slider --budget 120s --scale 0.25 --seeds 2 --rows events"
+    )
+
+
+def test_the_version_names_the_commit():
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
+    if head.returncode:
+        assert runner.code_version() == runner.enerf_ns.__version__
+    else:
+        version, _, commit = runner.code_version().partition("+")
+        assert version == runner.enerf_ns.__version__ and head.stdout.startswith(commit.removesuffix("-dirty"))
