@@ -320,9 +320,9 @@ class EnerfTrainer(Trainer):
         return results
 
     def eval_iteration(self, step: int) -> None:
-        super().eval_iteration(step)
         if not self.stop_training:
             self.error_against_time.after_step(step, self._metrics)
+        super().eval_iteration(step)
 
     def _finish(self, step: int) -> None:
         """Scores the run at its end, whose checkpoint is stored by then."""

@@ -40,6 +40,9 @@ STEPS_PER_PREVIEW = 500
 PREVIEW_WIDTH = 160
 """Pixels of the width of each picture of a preview at most."""
 
+RENDERING = 0.5
+"""What rendering a ray takes at most, as a share of a training step's time a ray."""
+
 EARLIEST = 0.01
 """Share of the training time from which on moments are spaced evenly in log time."""
 
@@ -172,7 +175,7 @@ class ErrorAgainstTime:
             with self._evaluation("moments"):
                 self._record(done)
                 self._line.show(self._status(done))
-        if len(self._durations) < STEPS_BEFORE:
+        if not self.share or len(self._durations) < STEPS_BEFORE:
             return
         total, allowed = self._total(done), self.share * self._total(done)
         for_previews = allowed / 2 - sum(self.costs["previews"])
@@ -192,10 +195,10 @@ class ErrorAgainstTime:
         return self.seconds + (self.num_steps - done) * median(self._durations)
 
     def _cost(self, kind: str, rays: int) -> float:
-        """Seconds that an evaluation takes: as long as those before, the first as long as training with its rays."""
+        """Seconds that an evaluation takes: as long as those before, the first as its rays suggest."""
         if self.costs[kind]:
             return mean(self.costs[kind])
-        return rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
+        return RENDERING * rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
 
     @contextmanager
     def _evaluation(self, kind: str | None = None) -> Iterator[None]:

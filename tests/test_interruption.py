@@ -108,6 +108,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
         config.steps_per_eval_batch = config.steps_per_eval_image = 2
         config.steps_per_save = 3
         config.save_only_latest_checkpoint = False
+        config.evaluation_share = 1.0
         return config
 
     straight = trained(config("straight"), first)
@@ -119,6 +120,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     resumed = trained(stored(stopped))
     assert resumed.base_dir == stopped.base_dir and checkpoints(resumed)[-1] == checkpoints(straight)[-1] == last
     one, other = (torch.load(run.checkpoint_dir / last) for run in (straight, resumed))
+    assert all(state.pop("error_against_time")["seconds"] > 0 for state in (one, other))
     same(one, other)
     assert one["sampler"].get("_step", first + STEPS - 1) == first + STEPS - 1
     assert one["schedulers"]["fields"]["last_epoch"] == STEPS

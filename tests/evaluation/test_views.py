@@ -15,7 +15,7 @@ from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_views, save_pictures
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_view, held_out_views, save_pictures
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 METRES = 2.5
@@ -60,6 +60,29 @@ def test_each_held_out_frame_is_seen_once_with_what_was_recorded_there(shown: An
 def test_depth_is_along_the_optical_axis_and_in_metres(shown: Any):
     for view in held_out_views(shown)[0]:
         torch.testing.assert_close(view.depth, torch.full((24, 32, 1), METRES), rtol=1e-5, atol=0)
+
+
+def test_a_view_is_reduced_to_means_over_squares_seen_from_their_middles(run: Run, recording: Path, tmp_path: Path):
+    """Columns that are left over are cut off; depth is known only where all of a square's is."""
+    whole, reduced = (held_out_view(run.pipeline.eval(), 1, by) for by in (1, 5))
+    assert whole.recorded is not None and reduced.recorded is not None and reduced.recorded_depth is not None
+    assert whole.recorded.shape == (24, 32, 3) and reduced.recorded.shape == reduced.rendered.shape == (4, 6, 3)
+    blocks = whole.recorded.numpy()[:20, :30].reshape(4, 5, 6, 5, 3)
+    np.testing.assert_allclose(reduced.recorded.numpy(), blocks.mean(axis=(1, 3)), atol=1e-6)
+    np.testing.assert_allclose(reduced.rendered, whole.rendered[2:20:5, 2:30:5], atol=1e-4)
+    np.testing.assert_allclose(reduced.depth, whole.depth[2:20:5, 2:30:5], rtol=1e-3)
+    file = run.pipeline.datamanager.eval_dataset.frames.depth_filenames[1]
+    depth, kept = load_array(file), file.read_bytes()
+    try:
+        depth[7, 11] = 0.0
+        np.save(file, depth)
+        found = held_out_view(run.pipeline, 1, 5).recorded_depth
+    finally:
+        file.write_bytes(kept)
+    assert found is not None and found[1, 2] == 0.0 and (found == 0.0).sum() == 1
+    blocks = depth[:20, :30].reshape(4, 5, 6, 5).mean(axis=(1, 3))
+    known = found[..., 0].numpy() > 0
+    np.testing.assert_allclose(found[..., 0].numpy()[known], blocks[known], rtol=1e-5)
 
 
 def test_renders_are_as_the_field_has_them_and_aligned_once_over_all_views(shown: Any):
