@@ -22,7 +22,8 @@ from enerf_ns.checkpoints import newest_checkpoint
 from enerf_ns.dataparsers import index_cache
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.enerf_config import enerf  # noqa: F401 - so that it is loaded before the fork
-from enerf_ns.evaluation import report, runs
+from enerf_ns.evaluation import runs
+from enerf_ns.report.writing import write_report
 
 STEPS = 30
 
@@ -116,8 +117,7 @@ draw_index = random.Random(1)
 
 def score(run: Path) -> None:
     """Without the video, whose tool writes it."""
-    report.render_video = lambda *_: None
-    report.write_report(runs.load(run / "config.yml"), run)
+    write_report([run], run, video=False)
 
 
 def check(recording: Path, run: Path, log: Path) -> None:

@@ -110,5 +110,6 @@ for point in distribution("enerf-ns").entry_points:
     )
     assert (packages / "enerf_ns" / "py.typed").is_file()
     assert (packages / "enerf_ns" / "dataparsers" / "inspection.html").is_file()
+    assert (packages / "enerf_ns" / "report" / "report.html").is_file()
     enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr

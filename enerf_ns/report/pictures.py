@@ -71,19 +71,16 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
 
     columns = _columns(views, recording)
     height, width = views[0].depth.shape[:2]
-    figure = Figure(
-        figsize=(2.35 * len(columns), 1.1 + 2.3 * len(views) * height / width), layout="constrained", dpi=110
-    )
-    axes = figure.subplots(len(views), len(columns), squeeze=False)
+    sides = [*[height / width] * len(views), 0.28]  # the last row explains the colours
+    figure = Figure(figsize=(2.35 * len(columns), 0.3 + 2.35 * sum(sides)), layout="constrained", dpi=110)
+    axes = figure.subplots(len(views) + 1, len(columns), squeeze=False, height_ratios=sides)
     for column, below in zip(columns, axes.T, strict=True):
         below[0].set_title(column.title)
-        for axis, picture in zip(below, column.pictures, strict=True):
+        for axis, picture in zip(below[:-1], column.pictures, strict=True):
             axis.set_xticks([])
             axis.set_yticks([])
             if picture is None:
-                axis.text(
-                    0.5, 0.5, "none at this time", ha="center", va="center", color="grey", transform=axis.transAxes
-                )
+                axis.text(0.5, 0.5, "none at this time", ha="center", va="center", transform=axis.transAxes)
                 axis.spines[:].set_visible(False)
             elif column.bar:
                 low, high = column.limits
@@ -91,24 +88,18 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
                 shown = axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
             else:
                 axis.imshow(picture)
+        below[-1].axis("off")
         if column.bar:
-            figure.colorbar(shown, ax=below, label=column.bar, location="bottom", shrink=0.9, aspect=16, pad=0.02)
+            bar = below[-1].inset_axes((0.04, 0.72, 0.92, 0.22))
+            figure.colorbar(shown, cax=bar, orientation="horizontal", label=column.bar)
         elif column.title == "events":
             handles = [
                 Patch(facecolor=np.array(colour) / 255, edgecolor="grey", label=what)
                 for what, colour in POLARITIES.items()
             ]
-            legend = below[-1].legend(
-                handles=handles,
-                loc="upper center",
-                bbox_to_anchor=(0.5, 0.0),
-                frameon=False,
-                fontsize=9,
-                handlelength=1,
-            )
-            legend.set_in_layout(False)  # it lies beside the bars
+            below[-1].legend(handles=handles, loc="upper center", frameon=False, fontsize=9, handlelength=1)
     if recording.held_out_frames is None:
-        for axis, view in zip(axes[:, 0], views, strict=True):
+        for axis, view in zip(axes[:-1, 0], views, strict=True):
             axis.set_ylabel(f"{view.time * 1e-9:.2f} s")
     return figure
 

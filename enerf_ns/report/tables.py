@@ -48,7 +48,8 @@ def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Seque
         cells = []
         for target in targets:
             found = seconds_to_reach(history, "psnr", target)
-            cells.append("not reached" if found is None else f"{'at most ' * found[1]}{found[0]:,.3g} s")
+            not_reached = "not reached" if any("psnr" in row.scores for row in history) else NONE
+            cells.append(not_reached if found is None else f"{'at most ' * found[1]}{found[0]:,.3g} s")
         rows.append([name, *cells])
     header = ["run", *(f"{target:g} dB" for target in targets)]
     note = (

@@ -15,11 +15,11 @@ def pareto_front(costs: Sequence[tuple[float, float]]) -> list[bool]:
     """Of each pair of costs, such as time and error, whether no other is as low in both and lower in one."""
     front, best = [False] * len(costs), float("inf")
     order = sorted(range(len(costs)), key=lambda number: costs[number])
-    for previous, number in zip([None, *order[:-1]], order, strict=True):
-        if costs[number][1] < best:
-            front[number], best = True, costs[number][1]
-        elif previous is not None and costs[number] == costs[previous]:
-            front[number] = front[previous]
+    for place, number in enumerate(order):
+        before = order[place - 1]
+        is_same = place > 0 and costs[number] == costs[before]
+        front[number] = front[before] if is_same else costs[number][1] < best
+        best = min(best, costs[number][1])
     return front
 
 

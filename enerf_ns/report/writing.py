@@ -203,7 +203,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
             views = [views[number] for number in shown]
         one.captions.append(
             f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)}, counted from 0, after {stored:,} steps. "
-            f"Error: purple where the render is too bright, orange where it is too dark."
+            f"Error: orange where the render is too bright, purple where it is too dark."
         )
         picture = _png(side_by_side(views, dataset.recording))
         path = json.dumps(camera_path(dataset.cameras))

@@ -6,6 +6,7 @@ with command lines as a person types them: starting each anew would cost ten sec
 
 from __future__ import annotations
 
+import base64
 import gzip
 import hashlib
 import importlib
@@ -319,17 +320,26 @@ def test_export_cameras(call, run: Path):
 
 def test_report(call, run: Path):
     call("enerf", "report", run, "--output-dir", "report")
-    scores = json.loads(Path("report/scores.json").read_text())
+    (scores,) = json.loads(Path("report/scores.json").read_text()).values()
     assert scores["lpips"] is None and scores["psnr"] > 5 and 0 < scores["depth_rmse"] and 1 < scores["mean_depth"] < 4
     assert Image.open("report/side-by-side.png").size[0] > 1000
     frame = check_video(Path("report/video.mp4"), frames=VIDEO_FRAMES, columns=2)
     assert frame.shape == (HEIGHT, 2 * WIDTH, 3), "even sides, which every player can show"
+    video = base64.b64encode(Path("report/video.mp4").read_bytes()).decode()
+    assert f"data:video/mp4;base64,{video}" in Path("report/report.html").read_text()
+
+
+def test_report_of_a_folder_goes_into_it_and_of_several_into_one_of_its_own(call, run: Path, tmp_path: Path):
+    call("enerf", "report", run.parent, "--no-video")
+    assert (run.parent / "report.html").is_file()
+    call("enerf", "report", run.parent, tmp_path, "--no-video", "--reach", 1, 2.5)
+    assert set(json.loads(Path("report/scores.json").read_text())) == {"recording", str(tmp_path)}
 
 
 def test_demo_on_a_recording_that_is_there_already(call, home: Path):
     shutil.copytree(home / "recording", "demo/recording")
     call("enerf", "demo", "--output-dir", "demo", "--max-num-iterations", 2)
-    scores = json.loads(Path("demo/scores.json").read_text())
+    (scores,) = json.loads(Path("demo/scores.json").read_text()).values()
     simulated = json.loads(Path("demo/recording/simulation.json").read_text())
     assert {"psnr", "ssim", "lpips", "depth_rmse", "train_seconds", "events"} <= set(scores)
     assert scores["train_seconds"] > 0 and scores["events"] == simulated["num_events"]

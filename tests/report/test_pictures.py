@@ -13,21 +13,22 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.scripts import render
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.evaluation import report
-from enerf_ns.evaluation.report import camera_path, render_video, side_by_side, write_report
+from enerf_ns.dataparsers.event_index import EventIndex, event_picture
+from enerf_ns.dataparsers.recording import EventRecording, Events
 from enerf_ns.evaluation.runs import Run
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.evaluation.views import HeldOutView, held_out_views
+from enerf_ns.report.pictures import camera_path, render_video, shown_numbers, side_by_side
 
 
-@pytest.fixture
-def no_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "render_video", lambda run, path, output: output.write_text(path.read_text()))
+def shown(run: Run) -> list[HeldOutView]:
+    return held_out_views(run.pipeline)[0]
 
 
+<<<<<<< HEAD:tests/report/test_report.py
 def test_a_report_holds_scores_a_picture_and_a_flight(run: Run, tmp_path: Path, no_video: None):
     scores = write_report(run, tmp_path / "new" / "report", {"train_seconds": 1.5})
     assert json.loads((tmp_path / "new/report/scores.json").read_text()) == scores
@@ -39,43 +40,63 @@ def test_a_report_holds_scores_a_picture_and_a_flight(run: Run, tmp_path: Path, 
     assert path == camera_path(run.pipeline.datamanager.eval_dataset.cameras)
     names = {file.name for file in (tmp_path / "new/report").iterdir()}
     assert names == {"scores.json", "side-by-side.png", "camera_path.json", "video.mp4"}
+=======
+@pytest.mark.parametrize(("number", "expected"), [(1, [0]), (2, [0, 1]), (3, [0, 1, 2]), (11, [0, 5, 10])])
+def test_the_shown_views_are_the_first_the_last_and_those_between(number: int, expected: list[int]):
+    assert shown_numbers(number) == expected
+>>>>>>> report:tests/report/test_pictures.py
 
 
-def test_a_report_without_frames_has_no_scores_of_pictures(run_without_frames: Run, tmp_path: Path, no_video: None):
-    scores = write_report(run_without_frames, tmp_path)
-    assert [scores[name] for name in ("psnr", "ssim", "lpips")] == [None] * 3
-    assert scores["event_correlation"] is not None and "correlation" not in scores
+ALL = ["held-out frame", "blurred frame", "render", "error", "rendered depth", "true depth", "events"]
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(run: Run, tmp_path: Path, monkeypatch, no_video: None):
-    (tmp_path / "scores.json").write_text("before")
+def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
+    recording, views = run.pipeline.datamanager.eval_dataset.recording, shown(run)
 
-    def full(path: Path, content: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def titles(views: list[HeldOutView], recording: EventRecording) -> list[str]:
+        figure = side_by_side(views, recording)
+        named = [axis.get_title() for axis in figure.axes if axis.get_title()]
+        assert sum(bool(axis.images) for axis in figure.axes) == len(named) * len(views)
+        return named
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OutputError, match=r"^--output-dir .* \(No space left on device\); give another folder\.$"):
-        write_report(run, tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["scores.json"]
-    assert (tmp_path / "scores.json").read_text() == "before"
-
-
-def test_a_folder_that_cannot_be_made_is_said_before_anything_is_rendered(run: Run, tmp_path: Path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr(report, "held_out_views", lambda _: pytest.fail("rendered"))
-    with pytest.raises(OutputError, match=r"^--output-dir .*file/report could not be written to \("):
-        write_report(run, tmp_path / "file" / "report")
-
-
-def test_the_picture_shows_three_views_and_their_events_where_clocks_are_one(run: Run):
-    recording = run.pipeline.datamanager.eval_dataset.recording
-    views, _ = held_out_views(run.pipeline)
-    figure = side_by_side(views + views, recording)
-    titles = ["held-out frame", "render", "depth", "events"]
-    assert [axis.get_title() for axis in figure.axes[:4]] == titles
-    assert len(figure.axes) == 3 * 4 + 1, "and the colour bar"
+    assert titles(views, recording) == ALL
+    assert titles(views[:1], replace(recording, blurred_frames=None)) == [name for name in ALL if name[0] != "b"]
     other_clock = replace(recording, held_out_frames=recording.frames)
-    assert [axis.get_title() for axis in side_by_side(views[:1], other_clock).axes[:-1]] == titles[:3]
+    assert titles(views, other_clock) == [name for name in ALL if name not in ("blurred frame", "events")]
+    without_depth = [replace(view, recorded_depth=None) for view in views]
+    assert titles(without_depth, recording) == [name for name in ALL if name != "true depth"]
+    without_frames = [replace(view, recorded=None) for view in without_depth]
+    assert titles(without_frames, replace(recording, frames=None, blurred_frames=None)) == ALL[2:3] + ALL[4:5] + ALL[6:]
+
+
+def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run):
+    views = shown(run)
+    figure = side_by_side(views, run.pipeline.datamanager.eval_dataset.recording)
+    pictures = np.reshape([axis.images[0] for axis in figure.axes[: 7 * len(views)]], (len(views), 7))
+    for view, row in zip(views, pictures, strict=True):
+        assert view.recorded is not None and view.recorded_depth is not None
+        expected = (view.rendered - view.recorded.clamp(0, 1)).mean(-1).numpy()
+        np.testing.assert_allclose(row[3].get_array(), expected, atol=1e-6)
+        low, high = row[3].get_clim()
+        assert low == -high and 0 < high <= np.abs(expected).max() + 1
+        depth = np.ma.filled(row[5].get_array(), np.nan)
+        np.testing.assert_array_equal(np.isnan(depth), view.recorded_depth[..., 0].numpy() <= 0)
+        assert row[4].get_clim() == row[5].get_clim()
+
+
+def test_the_legend_has_the_colours_of_brighter_and_darker(run: Run):
+    """By a picture of one event of each polarity."""
+    events = Events(np.array([1, 2]), np.array([1, 1]), np.array([5, 6]), np.array([1, -1]))
+    camera = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
+    picture = event_picture(EventIndex.from_events(events, 4, 3), camera, 10)
+    figure = side_by_side(shown(run)[:1], run.pipeline.datamanager.eval_dataset.recording)
+    (legend,) = [axis.get_legend() for axis in figure.axes if axis.get_legend()]
+    colours = {
+        text.get_text(): tuple(round(255 * channel) for channel in patch.get_facecolor()[:3])
+        for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
+    }
+    on, off, none = (tuple(picture[1, x].tolist()) for x in (1, 2, 3))
+    assert colours == {"brighter (on)": on, "darker (off)": off, "no event": none} and len({on, off, none}) == 3
 
 
 def cameras(number: int) -> Cameras:
@@ -148,43 +169,6 @@ def test_a_video_that_breaks_off_leaves_the_one_of_before(
     with pytest.raises(type(failure)):
         render_video(run, tmp_path / "path.json", tmp_path / "video.mp4")
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("video.mp4", "before")]
-
-
-@pytest.mark.parametrize(
-    ("output", "change"),
-    [
-        ("rgb", lambda rgb: 1.0 - rgb),
-        ("rgb", lambda rgb: rgb * 0.0),
-        ("rgb", lambda rgb: rgb * torch.nan),
-        ("rgb", lambda rgb: rgb + torch.inf),
-        ("depth", lambda depth: depth * torch.nan),
-        ("depth", lambda depth: depth * 0.0),
-    ],
-    ids=["negative", "dark", "nan", "inf", "nan depth", "no depth"],
-)
-@pytest.mark.parametrize("every", [1, 2])
-def test_whatever_a_field_shows_the_report_is_whole_and_json(
-    run: Run, tmp_path: Path, monkeypatch, no_video: None, output: str, change: Any, every: int
-):
-    """Of all frames or of every second: every mean that is missing has its reason, and the picture is drawn."""
-    model = run.pipeline.model
-    rendered, calls = model.get_outputs_for_camera_ray_bundle, []
-
-    def outputs(rays: Any) -> dict[str, torch.Tensor]:
-        calls.append(rays)
-        made = rendered(rays)
-        return made | ({output: change(made[output])} if len(calls) % every == 0 else {})
-
-    monkeypatch.setattr(model, "get_outputs_for_camera_ray_bundle", outputs)
-    table = write_report(run, tmp_path)
-    text = (tmp_path / "scores.json").read_text()
-    assert json.loads(text, parse_constant=lambda name: pytest.fail(name)) == table
-    reasons: Any = table["not_scored"]
-    for name in ("psnr", "ssim", "lpips", "correlation", "depth_rmse"):
-        left_out = sorted(number for numbers in reasons.get(name, {}).values() for number in numbers)
-        assert (table.get(name) is None) == (left_out == [0, 1, 2])
-        assert len(set(left_out)) == len(left_out)
-    assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
 
 
 @pytest.mark.slow

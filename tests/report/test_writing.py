@@ -1,0 +1,345 @@
+from __future__ import annotations
+
+import base64
+import csv
+import errno
+import io
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.evaluation.history import HistoryRow, append_row
+from enerf_ns.evaluation.runs import Run
+from enerf_ns.report import writing
+from enerf_ns.report.pictures import camera_path
+from enerf_ns.report.writing import Scoring, write_report
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+"""A browser that draws pages without a screen."""
+
+PLOTS = {"error-against-seconds.png", "error-against-steps.png", "step.png"}
+TEXTS = {"report.html", "report.md", "error-against-time.csv", "scores.json"}
+PARTS = {"sampling events": 0.001, "forward": 0.03, "backward": 0.02}
+
+
+def history(final: bool = True, better: float = 0.0) -> list[HistoryRow]:
+    """Of 5 rows up to step 16, PSNR from 10 dB to 18 dB."""
+    return [
+        HistoryRow(
+            2**n, 2.0**n, {"event_loss": 1 / 2**n}, {"psnr": 10 + 2 * n + better, "depth_rmse": 1 - n / 10}, 3, PARTS,
+            final and n == 4,
+        )
+        for n in range(5)
+    ]  # fmt: skip
+
+
+def copied(run: Run, home: Path, rows: list[HistoryRow], stored: bool = True, **changes: Any) -> Path:
+    """The folder of a copy of the run under another name, that of `home`, with a history and changes of its config."""
+    folder = home / "enerf" / "run"
+    shutil.copytree(run.config_file.parent, folder, ignore=None if stored else shutil.ignore_patterns("*models"))
+    config = yaml.load(run.config_file.read_text(), Loader=yaml.Loader)
+    for name, value in {"experiment_name": home.name, "output_dir": home.parent, **changes}.items():
+        setattr(config, name, value)
+    (folder / "config.yml").write_text(yaml.dump(config))
+    for row in rows:
+        append_row(folder, row)
+    return folder
+
+
+@pytest.fixture
+def moved(run: Run, tmp_path: Path) -> Path:
+    """A run whose recording is not where it was, with a history to its end."""
+    return copied(run, tmp_path / "moved", history(), data=tmp_path / "gone")
+
+
+@pytest.fixture
+def crashed(run: Run, tmp_path: Path) -> Path:
+    """A run that stored nothing but a history, the last line of which is cut short."""
+    folder = copied(run, tmp_path / "crashed", history(False, -1.5), stored=False, max_num_iterations=50)
+    with (folder / "history.jsonl").open("a") as file:
+        file.write('{"step": 32, "sec')
+    return folder
+
+
+class Page(HTMLParser):
+    """What a page loads, and its tables as text."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.sources: list[str] = []
+        self.tags: set[str] = set()
+        self.cells: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "poster")]
+        if tag in ("td", "th"):
+            self.cells.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.cells:
+            self.cells[-1] += data
+
+
+def page_of(folder: Path) -> Page:
+    """The page in a folder, which stands alone: every picture is whole, and within it."""
+    text = (folder / "report.html").read_text()
+    page = Page(text)
+    assert not {"script", "link", "iframe", "object"} & page.tags
+    assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text) and "url(" not in text
+    for source in page.sources:
+        kind, content = re.fullmatch(r"data:(image/png|video/mp4);base64,(.+)", source, re.DOTALL).groups()  # type: ignore[union-attr]
+        if kind == "image/png":
+            Image.open(io.BytesIO(base64.b64decode(content, validate=True))).load()
+    return page
+
+
+def names(folder: Path) -> set[str]:
+    return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO((folder / "error-against-time.csv").read_text())))
+
+
+def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_path: Path, monkeypatch):
+    """As runs of earlier versions are; the film itself is another test's."""
+    monkeypatch.setattr(writing, "render_video", lambda run, path, output: output.write_bytes(b"film"))
+    folder = tmp_path / "new" / "report"
+    entries = write_report([run], folder)
+    assert json.loads((folder / "scores.json").read_text()) == entries
+    (scores,) = entries.values()
+    assert list(entries) == [run.config.experiment_name]
+    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "brightness_scale", "fps"} <= set(scores)
+    assert scores["train_seconds"] > 0 and scores["lpips"] is None and scores["events"] > 0
+    assert (scores["state"], scores["step"], scores["num_frames"], scores["over_all_frames"]) == ("done", 2, 3, True)
+    assert json.loads((folder / "camera_path.json").read_text()) == camera_path(
+        run.pipeline.datamanager.eval_dataset.cameras
+    )
+    assert names(folder) == TEXTS | {"side-by-side.png", "camera_path.json", "video.mp4"}
+    assert Image.open(folder / "side-by-side.png").size[0] > 1000
+    assert rows_of(folder) == []
+    page = page_of(folder)
+    assert [source[:15] for source in page.sources] == ["data:image/png;", "data:video/mp4;"]
+    assert "after 2 steps" in (folder / "report.md").read_text()
+
+
+def test_a_large_video_is_beside_the_page(run: Run, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(writing, "render_video", lambda run, path, output: output.write_bytes(b"film"))
+    monkeypatch.setattr(writing, "LARGEST_EMBEDDED_VIDEO", 3)
+    write_report([run], tmp_path)
+    assert Page((tmp_path / "report.html").read_text()).sources[-1] == "video.mp4"
+
+
+def test_a_run_without_frames_is_scored_by_its_events(run_without_frames: Run, tmp_path: Path):
+    (scores,) = write_report([run_without_frames], tmp_path, video=False).values()
+    assert [scores[name] for name in ("psnr", "ssim", "lpips")] == [None] * 3
+    assert scores["event_correlation"] is not None and "correlation" not in scores
+    page_of(tmp_path)
+
+
+def test_scores_at_the_end_are_those_of_the_history(run: Run, tmp_path: Path):
+    """Those of another step are taken anew, of the field of the newest checkpoint."""
+    ended, going = copied(run, tmp_path / "ended", history()), copied(run, tmp_path / "going", history(False))
+    entries = write_report([ended, going], tmp_path / "report", video=False)
+    assert entries["ended"]["psnr"] == 18 and entries["ended"]["step"] == 16 and entries["ended"]["train_seconds"] == 16
+    fresh = write_report([run], tmp_path / "fresh", video=False)[run.config.experiment_name]
+    assert entries["going"]["psnr"] == pytest.approx(fresh["psnr"], rel=1e-5)
+    assert entries["going"]["step"] == 2 and entries["going"]["train_seconds"] == 2.0
+    pictures = {f"{name}/{file}" for name in ("ended", "going") for file in ("side-by-side.png", "camera_path.json")}
+    assert names(tmp_path / "report") == TEXTS | PLOTS | {"work-precision.png"} | pictures
+    page_of(tmp_path / "report")
+
+
+def test_of_a_moved_recording_there_are_curves_and_what_to_do(moved: Path, tmp_path: Path):
+    (scores,) = write_report([moved], tmp_path / "report").values()
+    assert scores["psnr"] == 18 and scores["state"] == "done" and "events" not in scores
+    assert names(tmp_path / "report") == TEXTS | PLOTS
+    words = f"The recording {tmp_path / 'gone'} is not there any more"
+    assert (
+        words in (tmp_path / "report/report.md").read_text() and words in (tmp_path / "report/report.html").read_text()
+    )
+    assert len(page_of(tmp_path / "report").sources) == 3
+
+
+def test_a_crashed_run_shows_its_history_up_to_the_line_that_is_whole(crashed: Path, tmp_path: Path):
+    (scores,) = write_report([crashed], tmp_path / "report").values()
+    assert scores["psnr"] == 16.5 and not scores["over_all_frames"] and scores["num_frames"] == 3
+    assert [row["step"] for row in rows_of(tmp_path / "report")] == ["1", "2", "4", "8", "16"]
+    assert "No whole checkpoint is stored" in (tmp_path / "report/report.md").read_text()
+
+
+@pytest.mark.parametrize("rows", [[], [HistoryRow(1, 0.5)], [HistoryRow(0, 0.0, scores={"psnr": 5.0})], history()[:1]])
+def test_a_run_of_no_step_or_one_has_a_report(run: Run, tmp_path: Path, rows: list[HistoryRow]):
+    folder = copied(run, tmp_path / "begun", rows, stored=False, max_num_iterations=50)
+    (scores,) = write_report([folder], tmp_path / "report").values()
+    assert scores["state"] == f"still going, {rows[0].step if rows else 0} of 50 steps"
+    assert len(rows_of(tmp_path / "report")) == len(rows)
+    page_of(tmp_path / "report")
+
+
+def test_the_newest_preview_stands_for_pictures_that_cannot_be_made(moved: Path, tmp_path: Path):
+    (moved / "previews").mkdir()
+    for step in (300, 1200):
+        Image.new("RGB", (step, 10)).save(moved / f"previews/step-{step:08d}.png")
+    write_report([moved], tmp_path / "report")
+    assert Image.open(tmp_path / "report/preview.png").size[0] == 1200
+    assert "step-00001200.png" in (tmp_path / "report/report.md").read_text()
+
+
+def test_the_csv_has_each_row_of_each_run(moved: Path, crashed: Path, tmp_path: Path):
+    write_report([moved, crashed, moved / "config.yml"], tmp_path / "report")
+    rows = rows_of(tmp_path / "report")
+    assert list(rows[0]) == [
+        "run", "seconds", "step", "psnr", "ssim", "lpips", "correlation", "depth_rmse", "event_correlation",
+        "num_frames", "event_loss",
+    ]  # fmt: skip
+    expected = [("moved", row) for row in history()] + [("crashed", row) for row in history(False, -1.5)]
+    assert len(rows) == len(expected)
+    for found, (name, row) in zip(rows, expected, strict=True):
+        assert found["run"] == name and found["ssim"] == found["lpips"] == ""
+        assert (float(found["seconds"]), int(found["step"]), int(found["num_frames"])) == (row.seconds, row.step, 3)
+        assert float(found["psnr"]) == row.scores["psnr"] and float(found["depth_rmse"]) == row.scores["depth_rmse"]
+        assert float(found["event_loss"]) == row.losses["event_loss"]
+
+
+def test_the_tables_tell_the_time_to_reach_and_the_parts_of_a_step(moved: Path, crashed: Path, tmp_path: Path):
+    write_report([moved, crashed], tmp_path / "report", reach=[9, 15, 17])
+    text = (tmp_path / "report/report.md").read_text()
+    assert "| run | 9 dB | 15 dB | 17 dB |\n| --- | --- | --- | --- |\n" in text
+    assert "| moved | at most 1 s | 6 s | 12 s |\n| crashed | 1.25 s | 10 s | not reached |" in text
+    assert "| moved | 1 ms (2%) | 30 ms (59%) | 20 ms (39%) | 51 ms |" in text
+    assert {"12 s", "not reached", "30 ms (59%)"} <= {cell.strip() for cell in page_of(tmp_path / "report").cells}
+
+
+def test_a_run_that_cannot_be_read_is_a_row_and_stops_no_other(moved: Path, tmp_path: Path):
+    (tmp_path / "empty | <b>").mkdir()
+    entries = write_report([tmp_path / "empty | <b>", moved, tmp_path / "nothing"], tmp_path / "report")
+    assert list(entries) == ["moved", str(tmp_path / "empty | <b>"), str(tmp_path / "nothing")]
+    assert "holds no config.yml" in entries[str(tmp_path / "empty | <b>")]["state"]
+    cells = page_of(tmp_path / "report").cells
+    assert str(tmp_path / "empty | <b>") in [cell.strip() for cell in cells]
+    table = [line for line in (tmp_path / "report/report.md").read_text().splitlines() if line.startswith("|")]
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table[:5]}) == 1, "a name breaks no row"
+
+
+def test_where_no_run_can_be_read_nothing_is_written(tmp_path: Path):
+    with pytest.raises(RecordingError, match=r"^\S+ holds no config\.yml; give [^.]+\.yml\.$"):
+        write_report([tmp_path], tmp_path / "report")
+    with pytest.raises(RecordingError, match=r"^No run can be read: .*holds no.*does not exist"):
+        write_report([tmp_path, tmp_path / "nothing"], tmp_path / "report")
+    with pytest.raises(FlagError, match="No run is given"):
+        write_report([], tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_recording_is_never_written_to(run: Run, recording: Path):
+    before = names(recording)
+    with pytest.raises(OutputError, match="lies within the recording"):
+        write_report([run], recording / "report")
+    assert names(recording) == before
+
+
+def test_no_flag_is_passed_over_in_silence(run: Run, tmp_path: Path):
+    with pytest.raises(FlagError, match="--protocol"):
+        write_report([run], tmp_path / "report", scoring=Scoring("raw"))
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(moved: Path, run: Run, tmp_path: Path, monkeypatch):
+    folder = tmp_path / "report"
+    folder.mkdir()
+    (folder / "scores.json").write_text("before")
+
+    def full(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for given in (moved, run):
+        with pytest.raises(OutputError, match=r"^--output-dir .* \(No space left on device\); give another folder\.$"):
+            write_report([given], folder)
+        assert names(folder) == {"scores.json"}
+        assert (folder / "scores.json").read_text() == "before"
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_anything_is_rendered(run: Run, tmp_path: Path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(writing, "held_out_views", lambda *_: pytest.fail("rendered"))
+    with pytest.raises(OutputError, match=r"^--output-dir .*file/report could not be written to \("):
+        write_report([run], tmp_path / "file" / "report")
+
+
+MEASURE = """<script>addEventListener("load", () => {
+  const seen = { width: innerWidth, page: document.documentElement.scrollWidth,
+    images: [...document.images].map(image => [image.complete, image.naturalWidth, image.clientWidth]),
+    rows: [...document.querySelectorAll("tr")].filter(row => row.clientHeight > 0).length };
+  const told = document.createElement("output"); told.id = "seen"; told.textContent = JSON.stringify(seen);
+  document.body.append(told); });</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
+@pytest.mark.parametrize("width", [500, 1280])
+def test_a_browser_shows_the_page(moved: Path, crashed: Path, run: Run, tmp_path: Path, width: int):
+    """With every picture; and nothing makes the page wider than a narrow window, such as the narrowest it opens."""
+    write_report([moved, crashed, run, tmp_path / "nothing"], tmp_path / "report", video=False)
+    measured = tmp_path / "measured.html"
+    measured.write_text((tmp_path / "report/report.html").read_text().replace("</body>", MEASURE))
+    dom = subprocess.run(
+        [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}",
+         f"--window-size={width},1000", "--virtual-time-budget=10000", "--dump-dom", measured.as_uri()],
+        capture_output=True, text=True, check=True, timeout=120,
+    ).stdout  # fmt: skip
+    told = re.search(r'<output id="seen">(.*?)</output>', dom)
+    assert told, dom[-500:]
+    seen = json.loads(told[1])
+    assert len(seen["images"]) == 4 + 1, "four plots, and the pictures of the one run whose recording is there"
+    assert all(complete and natural > 400 and shown > 300 for complete, natural, shown in seen["images"])
+    assert seen["page"] <= seen["width"] and seen["rows"] == 5 + 4 + 4 + 3
+
+
+@pytest.mark.parametrize(
+    ("output", "change"),
+    [
+        ("rgb", lambda rgb: 1.0 - rgb),
+        ("rgb", lambda rgb: rgb * 0.0),
+        ("rgb", lambda rgb: rgb * torch.nan),
+        ("rgb", lambda rgb: rgb + torch.inf),
+        ("depth", lambda depth: depth * torch.nan),
+        ("depth", lambda depth: depth * 0.0),
+    ],
+    ids=["negative", "dark", "nan", "inf", "nan depth", "no depth"],
+)
+@pytest.mark.parametrize("every", [1, 2])
+def test_whatever_a_field_shows_the_report_is_whole_and_json(
+    run: Run, tmp_path: Path, monkeypatch, output: str, change: Any, every: int
+):
+    """Of all frames or of every second: every mean that is missing has its reason, and the picture is drawn."""
+    model = run.pipeline.model
+    rendered, calls = model.get_outputs_for_camera_ray_bundle, []
+
+    def outputs(rays: Any) -> dict[str, torch.Tensor]:
+        calls.append(rays)
+        made = rendered(rays)
+        return made | ({output: change(made[output])} if len(calls) % every == 0 else {})
+
+    monkeypatch.setattr(model, "get_outputs_for_camera_ray_bundle", outputs)
+    entries = write_report([run], tmp_path, video=False)
+    (table,) = entries.values()
+    text = (tmp_path / "scores.json").read_text()
+    assert json.loads(text, parse_constant=lambda name: pytest.fail(name)) == entries
+    reasons: Any = table["not_scored"]
+    for name in ("psnr", "ssim", "lpips", "correlation", "depth_rmse"):
+        left_out = sorted(number for numbers in reasons.get(name, {}).values() for number in numbers)
+        assert (table.get(name) is None) == (left_out == [0, 1, 2])
+        assert len(set(left_out)) == len(left_out)
+    assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
