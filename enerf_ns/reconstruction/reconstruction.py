@@ -20,7 +20,7 @@ from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
-from enerf_ns.reconstruction.frames import NetworkReconstruction, reconstruct_frames
+from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, reconstruct_frames
 from enerf_ns.reconstruction.networks import load_network
 from enerf_ns.sensor.sensor_model import DEFAULT_CONTRAST_THRESHOLD
 
@@ -28,8 +28,9 @@ DEFAULT_FRAMES_PER_SECOND = 30.0
 """Frames reconstructed per second of a recording that has none."""
 
 DEFAULT_CUTOFF_FREQUENCY = 0.5
-"""Of the complementary filter, Hz. Of 0, 0.05, 0.1, 0.2, 0.5, 1 and 2, its frames resemble the true ones of slider_depth
-the most with this one, and those of a simulated shake nearly so (correlation 0.62 and 0.85; with 1: 0.56 and 0.86)."""
+"""Of the complementary filter, Hz. Of 0, 0.05, 0.1, 0.2, 0.5, 1 and 2, its frames resemble the true ones of
+slider_depth the most with this one, and those of a simulated shake nearly so (correlation 0.62 and 0.85; with 1: 0.56
+and 0.86)."""
 
 HIGHEST_CUTOFF_FREQUENCY = 1000.0
 """Highest of the complementary filter, Hz."""
@@ -39,8 +40,8 @@ MOST_FRAMES = 100_000
 
 RANGE_PERCENTILES = (1.0, 99.0)
 """Percentiles of the brightness of all frames that become black and white; one range for all, since a field has one
-brightness. Ranges of their own make FireNet's frames of slider_depth vary more (mean grey value 5.7 against 4.1, the true
-ones 1.6) at the same correlation (0.69)."""
+brightness. With a range of its own for each, FireNet's frames of slider_depth vary more (their mean grey value by 5.7
+against 4.1, that of the true ones by 1.6) at the same correlation (0.69)."""
 
 SAMPLED_PIXELS = 10_000_000
 """Pixels of all frames, spread evenly, of which the percentiles are taken at most."""

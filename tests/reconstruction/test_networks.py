@@ -93,7 +93,7 @@ def e2vid(**changes: Any) -> E2VID:
     torch.manual_seed(0)
     settings: dict[str, Any] = dict(num_encoders=3, num_residual_blocks=2, batch_norm=False, transposed=False)
     network = E2VID(num_bins=5, channels=4, **{**settings, **changes})
-    for name, value in network.named_buffers():
+    for value in network.buffers():
         if value.is_floating_point():
             value.uniform_(0.5, 1.5)
     return network
