@@ -399,6 +399,8 @@ class _Resolver:
             return
         blurred = self.parser.train_frames == "blurred" and recording.blurred_frames is not None
         what = "blurred frames" if blurred else "sharp frames"
+        if blurred and recording.reconstructed_by is not None:
+            what = f"frames of events, by {recording.reconstructed_by}"
         self.row("frame loss", True, what, f"supervision is {data.supervision}", name)
         frames = recording.blurred_frames if blurred else recording.frames
         if frames is not None and self.use_events:

@@ -227,7 +227,7 @@ class ErrorAgainstTime:
             chosen = () if final else (self._numbers, self._reduced_by)
             views, summary = held_out_views(pipeline, *chosen)
             found = summary_scores(views, summary) if final else mean_scores(views)[0]
-            scores = {name: score for name, score in found.items() if isinstance(score, float)}
+            scores = {name: score for name, score in found.items() if isinstance(score, (int, float))}
         correlation = pipeline.event_correlation() if final else pipeline.event_correlation(PAIRS)
         if isinstance(correlation, float):
             scores["event_correlation"] = correlation

@@ -11,6 +11,7 @@ import torch
 
 from enerf_ns.bench.experiments import NEAR
 from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import NotScored, mean_scores
@@ -25,7 +26,7 @@ ProtocolScores = dict[str, dict[str, float]]
 
 
 def evaluate(
-    run: Run, protocols: Sequence[str], measures: Sequence[str]
+    run: Run, protocols: Sequence[str], measures: Sequence[str], nets: Sequence[Net] = ("alex",)
 ) -> tuple[ProtocolScores, dict[str, NotScored]]:
     """Scores of a run.
 
@@ -33,6 +34,7 @@ def evaluate(
         run: Trained.
         protocols: Names of protocols; measures that have none stand with each.
         measures: Names of `MEASURES`.
+        nets: Networks of LPIPS.
 
     Returns:
         Mean scores over the held-out frames that have them, with what the measures add, ms_a_step and, where depths are
@@ -44,7 +46,7 @@ def evaluate(
         added |= MEASURES[name](run, views)
     scores, not_scored = {}, {}
     for protocol in protocols:
-        means, not_scored[protocol] = mean_scores(views)
+        means, not_scored[protocol] = mean_scores(views, False, protocol, nets)
         scores[protocol] = means | added
     return scores, not_scored
 

@@ -229,7 +229,8 @@ def _read_layers(path: Path) -> dict[str, Tensor]:
             ) from error
         raise
     state = content.get("state_dict", content) if isinstance(content, dict) else {}
-    tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    named = state.items() if isinstance(state, dict) else []
+    tensors = {name: value for name, value in named if isinstance(value, Tensor)}
     return {re.sub(r"^\w+\.(?=(head|encoders|resblocks|decoders|pred)\.)", "", name): tensors[name] for name in tensors}
 
 

@@ -14,12 +14,13 @@ from PIL import Image
 from rich.progress import track
 
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import of_file
 from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
-from enerf_ns.reconstruction.frames import NetworkReconstruction, reconstruct_frames
+from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, reconstruct_frames
 from enerf_ns.reconstruction.networks import load_network
 from enerf_ns.sensor.sensor_model import DEFAULT_CONTRAST_THRESHOLD
 
@@ -27,13 +28,20 @@ DEFAULT_FRAMES_PER_SECOND = 30.0
 """Frames reconstructed per second of a recording that has none."""
 
 DEFAULT_CUTOFF_FREQUENCY = 0.5
-"""Of the complementary filter, Hz."""
+"""Of the complementary filter, Hz. Of 0, 0.05, 0.1, 0.2, 0.5, 1 and 2, its frames resemble the true ones of
+slider_depth the most with this one, and those of a simulated shake nearly so (correlation 0.62 and 0.85; with 1: 0.56
+and 0.86)."""
+
+HIGHEST_CUTOFF_FREQUENCY = 1000.0
+"""Highest of the complementary filter, Hz."""
 
 MOST_FRAMES = 100_000
 """Most frames that are reconstructed of one recording."""
 
 RANGE_PERCENTILES = (1.0, 99.0)
-"""Percentiles of the brightness of all frames that become black and white."""
+"""Percentiles of the brightness of all frames that become black and white; one range for all, since a field has one
+brightness. With a range of its own for each, FireNet's frames of slider_depth vary more (their mean grey value by 5.7
+against 4.1, that of the true ones by 1.6) at the same correlation (0.69)."""
 
 SAMPLED_PIXELS = 10_000_000
 """Pixels of all frames, spread evenly, of which the percentiles are taken at most."""
@@ -70,6 +78,12 @@ def reconstruct(
     """
     if weights is not None and cutoff_frequency is not None:
         raise FlagError("--cutoff-frequency is of the complementary filter, but --weights were given; leave one out.")
+    if cutoff_frequency is None:
+        cutoff_frequency = DEFAULT_CUTOFF_FREQUENCY
+    if not 0 <= cutoff_frequency <= HIGHEST_CUTOFF_FREQUENCY:
+        raise FlagError(
+            f"--cutoff-frequency is {cutoff_frequency:g}, but must be from 0 to {HIGHEST_CUTOFF_FREQUENCY:g} (Hz)."
+        )
     with new_folder(source, output_dir) as folder:
         recording = read_recording(source, **options)  # type: ignore[arg-type]
         if recording.bayer_pattern is not None:
@@ -83,8 +97,6 @@ def reconstruct(
             name = f"{network.name} ({weights.name})"
             reconstruction = NetworkReconstruction(network, name, camera.width, camera.height)
         else:
-            if cutoff_frequency is None:
-                cutoff_frequency = DEFAULT_CUTOFF_FREQUENCY
             thresholds = recording.contrast_thresholds or 2 * (DEFAULT_CONTRAST_THRESHOLD,)
             size, start = (camera.width, camera.height), recording.span[0]
             reconstruction = ComplementaryFilter(*size, thresholds, cutoff_frequency, start)
@@ -93,7 +105,8 @@ def reconstruct(
         made.mkdir()
         brightness = reconstruct_frames(recording, reconstruction, times)
         shown = track(brightness, "Reconstructing frames", len(times), transient=True)
-        files = _write_frames(shown, (camera.width, camera.height), made)
+        with of_file(source):
+            files = _write_frames(shown, (camera.width, camera.height), made)
         frames = Frames(files, times, camera, recording.trajectory, numbers=numbers)
         with_frames = replace(recording, blurred_frames=frames, reconstructed_by=reconstruction.name)
         sentences = write_recording(with_frames, folder)
@@ -142,7 +155,7 @@ def _write_frames(
         The files.
 
     Raises:
-        RecordingError: All frames are of one brightness.
+        ValueError: All frames are of one brightness; a sentence that can follow "RECORDING holds".
         OSError: The disk is full.
     """
     stored, width, height = folder / "brightness.npy", *size
@@ -153,6 +166,8 @@ def _write_frames(
     brightness = np.load(stored, mmap_mode="r")
     pixels = brightness.reshape(-1)
     black, white = np.percentile(pixels[:: len(pixels) // SAMPLED_PIXELS + 1], RANGE_PERCENTILES)
+    if not white > black:
+        raise ValueError("no frame that is not of one brightness, since hardly an event comes before one")
     files = tuple(folder / f"{number:05d}.png" for number in range(len(brightness)))
     for file, frame in zip(files, brightness, strict=True):
         shades = 255.0 * ((frame - black) / (white - black)).clip(0.0, 1.0)

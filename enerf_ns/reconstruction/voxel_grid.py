@@ -11,7 +11,7 @@ from enerf_ns.dataparsers.recording import Events
 
 
 def voxel_grid(events: Events, num_bins: int, width: int, height: int) -> Float32[Tensor, "num_bins height width"]:
-    """Polarities summed by pixel and time, each event shared linearly by the two bins beside it (Zhu et al., CVPR 2019).
+    """Polarities summed by pixel and time, each event shared linearly by two bins (Zhu et al., CVPR 2019).
 
     Args:
         events: In time order; the first lies in the middle of bin 0 and the last in that of the last bin.

@@ -17,9 +17,11 @@ import numpy as np
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.evaluation.lpips import Net
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS, described
 from enerf_ns.evaluation.runs import Run, load
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.evaluation.views import aligned_views, held_out_views
 from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
 from enerf_ns.report.pictures import camera_path, render_video, shown_numbers, side_by_side
 from enerf_ns.report.run_files import RunFiles, read_run, run_names
@@ -37,14 +39,18 @@ CSV_FILE = "error-against-time.csv"
 
 @dataclass(frozen=True)
 class Scoring:
-    """How held-out frames are scored, where that is asked for; None: as every run is by default."""
+    """How held-out frames are scored; by default as every run is at its end."""
 
-    protocol: str | None = None
-    """Name of the protocol."""
-    lpips: tuple[str, ...] | None = None
+    protocol: str = DEFAULT_PROTOCOL
+    """Name of one of `enerf_ns.evaluation.protocols.PROTOCOLS`."""
+    lpips: tuple[Net, ...] = ("alex",)
     """Networks of LPIPS."""
-    crop: tuple[int, int, int, int] | None = None
-    """First and last row, first and last column of what is scored, pixels; the last ones excluded."""
+    crop: tuple[int, int] | None = None
+    """Height and width of the middle of each frame that alone is scored, pixels; None: all."""
+
+    def __post_init__(self) -> None:
+        if self.protocol not in PROTOCOLS:
+            raise FlagError(f"There is no --protocol {self.protocol}; choose one of {', '.join(PROTOCOLS)}.")
 
 
 @dataclass
@@ -56,6 +62,8 @@ class _Reported:
     prefix: str = ""
     """What the names of the run's own files begin with."""
     scores: dict[str, Any] = field(default_factory=dict)
+    protocol: str = DEFAULT_PROTOCOL
+    """How the scores are taken."""
     step: int = 0
     """Step whose field is scored."""
     num_frames: int = 0
@@ -70,11 +78,6 @@ class _Reported:
     captions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What is left out or wrong, and what to do about it."""
-
-    @property
-    def protocol(self) -> str:
-        """How the scores are taken."""
-        return "log-affine-set" if self.files.config.pipeline.datamanager.supervision == "events" else "raw"
 
     def entry(self) -> dict[str, Any]:
         """What scores.json holds of the run."""
@@ -113,8 +116,6 @@ def write_report(
         FlagError: There is no such way of scoring.
         OutputError: The folder cannot be written to, or the disk is full, or it lies within a recording.
     """
-    if scoring != Scoring():
-        raise FlagError("--protocol, --lpips and --crop are not known to this version; leave them out.")
     reported, unread = _read(runs)
     for one in reported:
         _check_outside(output_dir, one.files.config.data)
@@ -186,6 +187,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
     if scored:
         one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
         one.scores = dict.fromkeys(("psnr", "ssim", "lpips")) | scored.scores
+        one.protocol = DEFAULT_PROTOCOL if scored.num_frames else EVENTS_PROTOCOL
     else:
         one.step = one.files.steps
     if run is None:
@@ -199,8 +201,10 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         stored = int(run.config.load_step or 0) + 1
         if anew:
             one.step, one.num_frames, one.over_all_frames = stored, len(views), True
-            one.scores = summary_scores(views, summary)
+            one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
+            one.protocol = one.scores.pop("protocol")
             views = [views[number] for number in shown]
+        views, _ = aligned_views(views, scoring.protocol)
         one.captions.append(
             f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)}, counted from 0, after {stored:,} steps. "
             f"Error: orange where the render is too bright, purple where it is too dark."
@@ -302,13 +306,21 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
             "training": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
             **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
             "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.scores else NONE,
+            "of them on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
             "protocol": one.protocol if one.scores else NONE,
         }
         for one in reported
     ]
     rows += [dict.fromkeys(rows[0], NONE) | {"run": path, "state": fault} for path, fault in unread.items()]
     header = [name for name in rows[0] if any(row[name] != NONE for row in rows)]
-    note = "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored."
+    protocols = dict.fromkeys(one.protocol for one in reported if one.scores)
+    note = " ".join(
+        [
+            "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored.",
+            "On the path are held-out poses that lie among those that were learnt from." * ("of them on the path" in header),
+            *map(described, protocols),
+        ]
+    )
     return Table("Scores", header, [[row[name] for name in header] for row in rows], note)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Optional  # tyro reads these annotations on Python 3.10
 
@@ -27,19 +27,14 @@ class Report:
     """PSNR in dB whose training time is told. None: some that the runs reach."""
     video: bool = True
     """Render a flight past the held-out cameras."""
-    protocol: Optional[str] = None  # noqa: UP045
-    """Score held-out frames anew by this protocol."""
-    lpips: Optional[tuple[str, ...]] = None  # noqa: UP045
-    """Score anew, with these networks of LPIPS."""
-    crop: Optional[tuple[int, int, int, int]] = None  # noqa: UP045
-    """Score anew these pixels alone: first and last row, first and last column, the last ones excluded."""
+    scoring: Annotated[Scoring, tyro.conf.arg(name="")] = field(default_factory=Scoring)
+    """How held-out frames are scored; what is not the default is scored anew."""
 
     def main(self) -> None:
         output_dir = self.output_dir
         if output_dir is None and len(self.runs) == 1:
             output_dir = self.runs[0] if self.runs[0].is_dir() else self.runs[0].parent
         output_dir = (output_dir or Path("report")).expanduser().resolve()
-        scoring = Scoring(self.protocol, self.lpips, self.crop)
-        scores = write_report(self.runs, output_dir, self.reach, scoring, self.video)
+        scores = write_report(self.runs, output_dir, self.reach, self.scoring, self.video)
         CONSOLE.print(scores)
         CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)

@@ -28,23 +28,9 @@ def shown(run: Run) -> list[HeldOutView]:
     return held_out_views(run.pipeline)[0]
 
 
-<<<<<<< HEAD:tests/report/test_report.py
-def test_a_report_holds_scores_a_picture_and_a_flight(run: Run, tmp_path: Path, no_video: None):
-    scores = write_report(run, tmp_path / "new" / "report", {"train_seconds": 1.5})
-    assert json.loads((tmp_path / "new/report/scores.json").read_text()) == scores
-    assert scores["protocol"] == "log-affine-set"
-    assert scores["train_seconds"] == 1.5 and scores["lpips"] is None
-    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "held_out_on_path", "fps"} <= set(scores)
-    assert Image.open(tmp_path / "new/report/side-by-side.png").size[0] > 1000
-    path = json.loads((tmp_path / "new/report/camera_path.json").read_text())
-    assert path == camera_path(run.pipeline.datamanager.eval_dataset.cameras)
-    names = {file.name for file in (tmp_path / "new/report").iterdir()}
-    assert names == {"scores.json", "side-by-side.png", "camera_path.json", "video.mp4"}
-=======
 @pytest.mark.parametrize(("number", "expected"), [(1, [0]), (2, [0, 1]), (3, [0, 1, 2]), (11, [0, 5, 10])])
 def test_the_shown_views_are_the_first_the_last_and_those_between(number: int, expected: list[int]):
     assert shown_numbers(number) == expected
->>>>>>> report:tests/report/test_pictures.py
 
 
 ALL = ["held-out frame", "blurred frame", "render", "error", "rendered depth", "true depth", "events"]

@@ -19,7 +19,10 @@ from PIL import Image
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.evaluation.history import HistoryRow, append_row
+from enerf_ns.evaluation.protocols import described
 from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.report import writing
 from enerf_ns.report.pictures import camera_path
 from enerf_ns.report.writing import Scoring, write_report
@@ -251,9 +254,12 @@ def test_a_recording_is_never_written_to(run: Run, recording: Path):
     assert names(recording) == before
 
 
-def test_no_flag_is_passed_over_in_silence(run: Run, tmp_path: Path):
-    with pytest.raises(FlagError, match="--protocol"):
-        write_report([run], tmp_path / "report", scoring=Scoring("raw"))
+def test_held_out_frames_are_scored_as_asked_for(run: Run, tmp_path: Path):
+    views, summary = held_out_views(run.pipeline)
+    expected = summary_scores(views, summary, False, "raw", (), (16, 20))
+    (entry,) = write_report([run], tmp_path / "report", scoring=Scoring("raw", (), (16, 20)), video=False).values()
+    assert entry["protocol"] == "raw" and entry["psnr"] == expected["psnr"] and "lpips" not in entry
+    assert described("raw") in (tmp_path / "report" / "report.md").read_text()
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(moved: Path, run: Run, tmp_path: Path, monkeypatch):

@@ -10,7 +10,9 @@ import pytest
 from enerf_ns.scripts import cli
 
 
-@pytest.mark.parametrize("command", [[], ["bench"], ["convert"], ["demo"], ["inspect"], ["report"], ["simulate"]])
+@pytest.mark.parametrize(
+    "command", [[], *([name] for name in ("bench", "convert", "demo", "inspect", "reconstruct", "report", "simulate"))]
+)
 def test_every_command_has_a_help(command: list[str], monkeypatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(sys, "argv", ["enerf", *command, "--help"])
     with pytest.raises(SystemExit) as end:
@@ -26,6 +28,7 @@ def test_every_command_has_a_help(command: list[str], monkeypatch, capsys: pytes
         (["inspect", "nowhere"], "nowhere does not exist"),
         (["convert", "nowhere", "--output-dir", "new"], "nowhere does not exist"),
         (["bench", "nothing"], "There is no experiment nothing; choose one of"),
+        (["reconstruct", "nowhere", "--output-dir", "new"], "nowhere is not a folder"),
         (["report", "config.yml"], "config.yml does not exist"),
         (["simulate", "shapes", "--output-dir", "new", "--duration", "0"], "--duration is 0.0, but must be"),
         (["simulate", "nothing", "--output-dir", "new"], "nothing is neither a preset"),

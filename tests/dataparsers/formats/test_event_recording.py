@@ -90,6 +90,7 @@ def test_reads_what_was_written(tmp_path: Path):
     assert recording.camera == Camera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 8.5)
     assert recording.contrast_thresholds == (0.2, 0.3) and recording.depth_range == (1.0, 4.5)
     assert recording.refractory_period == 1500 and recording.bayer_pattern == "RGGB"
+    assert recording.reconstructed_by is None
     assert recording.frames is not None and recording.blurred_frames is not None
     for frames, folder in ((recording.frames, "frames"), (recording.blurred_frames, "blurred_frames")):
         np.testing.assert_array_equal(frames.times, FRAME_TIMES)
@@ -205,6 +206,7 @@ def same_recording(found: EventRecording, expected: EventRecording) -> None:
     assert found.camera == expected.camera
     np.testing.assert_array_equal(found.camera.pixel_directions(), expected.camera.pixel_directions())
     assert found.contrast_thresholds == expected.contrast_thresholds and found.depth_range == expected.depth_range
+    assert found.reconstructed_by == expected.reconstructed_by
     assert found.refractory_period == expected.refractory_period and found.bayer_pattern == expected.bayer_pattern
     for ours, theirs in ((found.frames, expected.frames), (found.blurred_frames, expected.blurred_frames)):
         assert (ours is None) == (theirs is None)
@@ -429,6 +431,7 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     "response unknown": ({"response": "log"}, "the response 'log', but linlog, or logarithm:OFFSET with an"),
     "offset negative": ({"response": "logarithm:-1"}, "the response 'logarithm:-1', but"),
     "response no text": ({"response": 0.001}, "the response 0.001, but"),
+    "reconstructed by a number": ({"reconstructed_by": 4}, "reconstructed_by = 4, but a text was expected"),
     "no colour": ({"bayer_pattern": 4}, "the Bayer pattern 4, but four"),
 }
 

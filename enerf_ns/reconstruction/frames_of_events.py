@@ -58,12 +58,11 @@ class NetworkReconstruction:
     def add(self, events: Events) -> None:
         self._waiting.append(events)
         if sum(map(len, self._waiting)) >= 2 * self._window:
-            waiting = joined(self._waiting)
-            last = len(waiting) - self._window
-            for first in range(0, last, self._window):
-                rest = first + self._window
-                self._look_at(part(waiting, first, rest))
-            self._waiting = [part(waiting, rest, len(waiting))]
+            waiting, first = joined(self._waiting), 0
+            while len(waiting) - first >= 2 * self._window:
+                self._look_at(part(waiting, first, first + self._window))
+                first += self._window
+            self._waiting = [part(waiting, first, len(waiting))]
 
     def frame(self, time: int) -> Float32[np.ndarray, "height width"]:
         """As the network shows it after all events up to now: what waits is looked at in windows of one size."""
