@@ -30,6 +30,8 @@ PUBLISHED_LOSSES: dict[str, PublishedLosses] = {
             "pipeline.model.sensor.response": "linlog",
             "pipeline.model.sensor.refractory_period_ns": 0,
             "pipeline.model.event_loss": "squared",
+            "pipeline.model.no_event_loss_weight": 5.0,  # as enerf-paper has it, for runs with silent pairs
+            "pipeline.model.no_event_margin": 1.0,
         },
     ),
     "enerf-eventnerf": PublishedLosses(

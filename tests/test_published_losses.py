@@ -184,8 +184,8 @@ def test_windows_begin_where_they_begin_whatever_the_refractory_period(recording
 def test_a_field_that_is_gamma_encoded_changes_as_a_linear_one_to_its_power(recording: Path, tmp_path: Path):
     """What a render of it means: brightness to the power of 1 / 2.2."""
     pipeline, events, *_ = first_step(recording, tmp_path, "enerf-eventnerf")
-    linear = torch.rand(2, len(events), 1, dtype=torch.float64)
+    start, end = torch.rand(2, len(events), 1, dtype=torch.float64)
     sensor = pipeline.model.sensor
-    change = brightness_change(*(linear ** (1 / 2.2)), events, sensor)
+    change = brightness_change(start ** (1 / 2.2), end ** (1 / 2.2), events, sensor)
     sensor.response = Logarithm(1e-5)
-    torch.testing.assert_close(change, brightness_change(*linear, events, sensor))
+    torch.testing.assert_close(change, brightness_change(start, end, events, sensor))

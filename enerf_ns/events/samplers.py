@@ -339,7 +339,8 @@ class AccumulationSampler:
         fired = torch.cat(found, dim=1)
         if fired.shape[1]:
             fired = fired[:, torch.arange(batch_size - negatives, device=fired.device) % fired.shape[1]]
-        return EventBatch(*torch.cat([fired, negative], dim=1))
+        pixels, start, end, on, off = torch.cat([fired, negative], dim=1)
+        return EventBatch(pixels, start, end, on, off)
 
     def _windows(self, draws: int, generator: torch.Generator) -> Int64[Tensor, "5 windows"]:
         """Pixels, starts, ends, on and off events of windows of any length but 0 at any pixel; at most `draws`."""

@@ -541,7 +541,7 @@ def assert_windows_as_likely(pairs: list[tuple[int, int, int]], weights: Counter
     """By pixel and time, and by time and length (chi-square tests); what is expected less than five times is one."""
     keys = [(pixel, (b - start) * 10 // (end - start + 1), (b - a - 1) * 9 // LONGEST) for pixel, a, b in pairs]
     for chosen in (slice(2), slice(1, 3)):
-        drawn, expected = Counter(key[chosen] for key in keys), Counter()
+        drawn, expected = Counter(key[chosen] for key in keys), defaultdict(float)
         for key, weight in weights.items():
             expected[key[chosen]] += weight * len(pairs) / weights.total()
         assert set(drawn) <= set(expected)
