@@ -160,7 +160,9 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
         try:
             frames = frames.with_exposure(round(config.exposure_ms * 1e6))
         except ValueError as error:
-            raise FlagError(f"event-data --exposure-ms {config.exposure_ms:g} gives {recording.path} {error}") from error
+            raise FlagError(
+                f"event-data --exposure-ms {config.exposure_ms:g} gives {recording.path} {error}"
+            ) from error
     posed = ~recording.in_left_out_gaps(frames.times)
     if not posed.any():
         raise RecordingError(

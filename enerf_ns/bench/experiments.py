@@ -10,6 +10,7 @@ from typing import Any, Literal
 from enerf_ns.bench import published
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS, Published
 from enerf_ns.paper_selections import SPIRAL_1
+from enerf_ns.published_losses import PUBLISHED_LOSSES
 
 PARSER, DATA, MODEL = "pipeline.datamanager.dataparser.", "pipeline.datamanager.", "pipeline.model."
 
@@ -94,9 +95,6 @@ def _no_event_loss(weight: float) -> dict[str, Any]:
     on = {DATA + "silent_pairs": SILENT_PAIRS, MODEL + "no_event_loss_weight": weight / PAPER_C}
     return {**PAPER_LOSS, **on} if weight else PAPER_LOSS
 
-
-PUBLISHED_LOSSES = ("enerf-paper-loss", "enerf-eventnerf", "enerf-robust", "enerf-deblur")
-"""Methods with the field of enerf and the losses of a publication."""
 
 FORCED_ON: dict[str, Any] = {
     DATA + "silent_pairs": SILENT_PAIRS,

@@ -29,6 +29,7 @@ from enerf_ns.dataparsers.errors import FlagError, OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.evaluation.history import read_history
+from enerf_ns.evaluation.lpips import NETWORKS
 from enerf_ns.evaluation.runs import method_config, set_up, train
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
@@ -229,6 +230,7 @@ class Bench:
             "weights": weights and hashlib.sha256(weights.expanduser().read_bytes()).hexdigest(),
             "budget": settings.budget,
             "protocols": self.experiment.protocols,
+            "vgg": "lpips_vgg" in self.experiment.columns,
             "measures": self.experiment.measures,
             "threads": torch.get_num_threads(),
             "device": device_name(),
@@ -277,7 +279,8 @@ class Bench:
         if history:
             run = replace(run, train_seconds=history[-1].seconds)
         assert run.train_seconds is not None
-        scores, not_scored = evaluate(run, self.experiment.protocols, self.experiment.measures)
+        nets = [net for net, network in NETWORKS.items() if net == "alex" or network.score in self.experiment.columns]
+        scores, not_scored = evaluate(run, self.experiment.protocols, self.experiment.measures, nets)
         result: dict[str, Any] = {
             "steps": config.max_num_iterations,
             "seconds": round(run.train_seconds, 2),
@@ -329,7 +332,7 @@ class Bench:
                     simulate(SimulationSettings(**given), folder)
         if row.reconstruction is None:
             return recording
-        from enerf_ns.reconstruction.reconstruction import reconstruct  # pyright: ignore[reportMissingImports]
+        from enerf_ns.reconstruction.reconstruction import reconstruct
 
         weights = self.settings.reconstruction_weights if row.reconstruction == "e2vid" else None
         about = self._about(cell)

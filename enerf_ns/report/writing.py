@@ -317,7 +317,8 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
     note = " ".join(
         [
             "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored.",
-            "On the path are held-out poses that lie among those that were learnt from." * ("of them on the path" in header),
+            "On the path are held-out poses that lie among those that were learnt from."
+            * ("of them on the path" in header),
             *map(described, protocols),
         ]
     )
