@@ -80,3 +80,6 @@ SMALL: dict[str, Any] = {
     "pipeline.model.num_proposal_samples": 16,
 }
 """What a run that takes seconds changes of the method, by the names of ns-train's flags."""
+
+SMALL_BENCH: dict[str, Any] = {"budget": "2", "scale": 0.05, "rows": ("events", "uniform-samples")}
+"""Settings of `enerf bench`: two rows of two steps each, on 32 x 24 pixels."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -102,10 +103,11 @@ def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     rest."""
     manager, sensor = run.pipeline.datamanager, run.pipeline.model.sensor
     supervision = manager.config.supervision
-    parts = dict.fromkeys(("sample", "poses", "rays", "images"), 0.0)
-    for part, learnt_from in {"sample": "events", "images": "frames"}.items():
-        if learnt_from in supervision:
-            manager.config.supervision = learnt_from
+    parts: dict[str, float] = dict.fromkeys(("sample", "poses", "rays", "images"), 0.0)
+    learnt_from: dict[str, Literal["events", "frames"]] = {"sample": "events", "images": "frames"}
+    for part, name in learnt_from.items():
+        if name in supervision:
+            manager.config.supervision = name
             parts[part] = _milliseconds(lambda: manager.next_batch(sensor), run)
     manager.config.supervision = supervision
     batch = manager.next_batch(sensor)

@@ -323,7 +323,7 @@ class Bench:
             recording = self.output_dir / "recordings" / f"{stem}-{_digest([simulation, sequence.files])}"
             with _made_whole(recording) as folder:
                 if folder is not None:
-                    given = {
+                    given: dict[str, Any] = {
                         name: str(self._file(value, sequence.files[value])) if value in sequence.files else value
                         for name, value in simulation.items()
                     }

@@ -103,8 +103,8 @@ def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
     theirs = [name for name in columns if any(name in line.published for line in table)]
     several = len(results["protocols"]) > 1
     source = results["source"]
-    head = ["sequence", "row", *(["protocol"] if several else []), *(TITLES.get(name, name) for name in columns)]
-    head += ["training, s", "steps", *(f"{source}: {TITLES.get(name, name)}" for name in theirs)]
+    head = ["sequence", "row", *(["protocol"] if several else []), *map(_title, columns)]
+    head += ["training, s", "steps", *(f"{source}: {_title(name)}" for name in theirs)]
     content = []
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
@@ -114,6 +114,10 @@ def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
         cells += [_published(name, line.published[name]) if name in line.published else "-" for name in theirs]
         content.append(cells)
     return head, content
+
+
+def _title(name: str) -> str:
+    return TITLES.get(name, name)
 
 
 def _score(name: str, values: list[float]) -> str:
@@ -159,7 +163,7 @@ def disagreements(results: Results) -> list[str] | None:
 
 def remarks(results: Results) -> Iterator[str]:
     """What belongs to the table, a sentence each: how it was made, what is missing, where the order is another."""
-    runs, name = results["runs"], TITLES.get(results["columns"][0], results["columns"][0]).partition(",")[0]
+    runs, name = results["runs"], _title(results["columns"][0]).partition(",")[0]
     seeds = 1 + max((run["seed"] for run in runs), default=0)
     size = "" if results["scale"] is None else f" at scale {results['scale']:g} of 640 x 480"
     budget = results["budget"] if results["budget"].endswith("s") else f"{results['budget']} steps"

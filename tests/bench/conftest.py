@@ -4,11 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_runs import SMALL_BENCH
 
 from enerf_ns.bench.runner import Bench, BenchSettings
-
-SMALL = {"budget": "2", "scale": 0.05, "rows": ("events", "uniform-samples")}
-"""Two rows of two steps each on 32 x 24 pixels."""
 
 
 @pytest.fixture(scope="session")
@@ -17,7 +15,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    for _ in Bench("design", BenchSettings(**SMALL, output_dir=folder)).run():
+    for _ in Bench("design", BenchSettings(**SMALL_BENCH, output_dir=folder)).run():
         pass
     torch.set_num_threads(threads)
     return folder

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import SMALL
+from small_runs import SMALL_BENCH
 
 from enerf_ns.bench import runner
 from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
@@ -43,7 +43,7 @@ def simulated(finished: Path, tmp_path: Path) -> Path:
 
 
 def bench(folder: Path, name: str = "design", **changes: Any) -> Bench:
-    return Bench(name, BenchSettings(**{**SMALL, "output_dir": folder, **changes}))
+    return Bench(name, BenchSettings(**{**SMALL_BENCH, "output_dir": folder, **changes}))
 
 
 def finish(folder: Path, **changes: Any) -> list[str]:
@@ -122,7 +122,7 @@ def test_a_bench_that_is_killed_between_rows_and_inside_of_them_ends_with_the_sa
     """Killed while it simulates, while the first row is trained, and once that is finished."""
     command = [sys.executable, "-c", "from enerf_ns.scripts.cli import entrypoint; entrypoint()", "bench", "design"]
     command += ["--budget", "2", "--scale", "0.05", "--threads", "1", "--output-dir", str(tmp_path)]
-    command += ["--rows", *SMALL["rows"]]
+    command += ["--rows", *SMALL_BENCH["rows"]]
     for pattern in ("recordings/.*/*", "runs/*/*/*/config.yml", "runs/*/*/*/result.json"):
         process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
         while not list(tmp_path.glob(pattern)):
