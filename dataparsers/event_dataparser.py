@@ -160,7 +160,9 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
         try:
             frames = frames.with_exposure(round(config.exposure_ms * 1e6))
         except ValueError as error:
-            raise FlagError(f"event-data --exposure-ms {config.exposure_ms:g} gives {recording.path} {error}") from error
+            raise FlagError(
+                f"event-data --exposure-ms {config.exposure_ms:g} gives {recording.path} {error}"
+            ) from error
     posed = ~recording.in_left_out_gaps(frames.times)
     if not posed.any():
         raise RecordingError(
@@ -191,7 +193,7 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
     known = recording.knows_poses(frames)
     if not known.any():
         raise RecordingError(
-            f"The exposures of all frames of {recording.path} to train on reach beyond the poses, or into gaps of them; "
+            f"The exposures of all frames of {recording.path} to train on reach beyond the poses or into gaps of them; "
             "add the poses that are missing, or take the frames as instants with --exposure-ms 0."
         )
     return frames.subset(np.flatnonzero(known)), True

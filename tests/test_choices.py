@@ -294,7 +294,10 @@ def test_sharp_frames_are_instants(recording: Path):
 
 @pytest.mark.parametrize(
     ("exposure_ms", "message"),
-    [(20.0, "--exposure-ms 20 gives .* exposures of 20 ms of frames that are 9.09"), (1e-4, "the exposure 100 ns, but")],
+    [
+        (20.0, "--exposure-ms 20 gives .* exposures of 20 ms of frames that are 9.09"),
+        (1e-4, "the exposure 100 ns, but"),
+    ],
 )
 def test_an_exposure_that_no_frame_can_have_is_refused(recording: Path, exposure_ms: float, message: str):
     with pytest.raises(FlagError, match=message):

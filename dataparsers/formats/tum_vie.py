@@ -170,9 +170,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     if rig.frame_camera is not None:
         frame_trajectory = markers.of_mounted(marker_from_imu @ rig.imu_from_frame_camera)
         with of_file(images):
-            frames = Frames(
-                frame_files, frame_times - zero, rig.frame_camera, frame_trajectory, exposures=exposures
-            )
+            frames = Frames(frame_files, frame_times - zero, rig.frame_camera, frame_trajectory, exposures=exposures)
     return EventRecording(
         path=folder,
         format="tum_vie",

@@ -36,7 +36,9 @@ def test_what_was_rendered_is_taken_apart_as_its_rays_were_put_together():
 
 
 def test_what_a_frame_shows_is_the_mean_over_its_instants():
-    rendered = torch.tensor([[0.0, 5.0], [1.0, 5.0], [2.0, 0.0], [4.0, 6.0], [9.0, 0.0], [20.0, 0.0], [1.0, 3.0], [0.0, 0.0]])
+    rendered = torch.tensor(
+        [[0.0, 5.0], [1.0, 5.0], [2.0, 0.0], [4.0, 6.0], [9.0, 0.0], [20.0, 0.0], [1.0, 3.0], [0.0, 0.0]]
+    )
     parts = TrainBatch(events(1, 0, False), frames_of(2, 3)).split(rendered)
     assert [part.tolist() for part in parts] == [[[0, 5]], [[1, 5]], [[5, 2], [7, 1]]]
 

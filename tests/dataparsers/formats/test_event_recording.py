@@ -512,12 +512,18 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
         put("frames/exposures_ns.txt", "5000000\n400000000\n400000000\n"),
         "exposures_ns.txt holds exposures of 400 ms of frames that are 300 ms apart, but",
     ),
-    "exposures beyond all times": (put("frames/exposures_ns.txt", "1e300\n0\n0\n"), "but exposures up to the time from"),
+    "exposures beyond all times": (
+        put("frames/exposures_ns.txt", "1e300\n0\n0\n"),
+        "but exposures up to the time from",
+    ),
     "exposure no number": (
         put("frames/exposures_ns.txt", "0\nlong\n0\n"),
         "exposures_ns.txt, line 2 holds 'long' where a finite number was expected",
     ),
-    "exposures empty": (put("frames/exposures_ns.txt", ""), "exposures_ns.txt is empty; rows of the columns exposure_ns"),
+    "exposures empty": (
+        put("frames/exposures_ns.txt", ""),
+        "exposures_ns.txt is empty; rows of the columns exposure_ns",
+    ),
     "a frame missing": (remove("frames/1.png"), "frames holds 2 images, but its stamps_ns.txt holds 3 stamps"),
     "frame of another size": (
         lambda folder: write_image(folder / "frames/1.png", np.zeros((4, 5, 1), np.uint8)),
