@@ -193,7 +193,7 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
     known = recording.knows_poses(frames)
     if not known.any():
         raise RecordingError(
-            f"The exposures of all frames of {recording.path} to train on reach beyond the poses, or into gaps of them; "
+            f"The exposures of all frames of {recording.path} to train on reach beyond the poses or into gaps of them; "
             "add the poses that are missing, or take the frames as instants with --exposure-ms 0."
         )
     return frames.subset(np.flatnonzero(known)), True

@@ -474,21 +474,21 @@ class _Resolver:
         if frames.exposures is None:
             if (self.config.datamanager.exposure_samples or 1) > 1:
                 raise FlagError(
-                    f"{self.recording.path}: the recording states no exposures, but --pipeline.{name.replace('_', '-')} "
-                    "averages over them; state them with event-data --exposure-ms"
+                    f"{self.recording.path}: the recording states no exposures, but "
+                    "--pipeline.datamanager.exposure-samples averages over them; state them with event-data "
+                    "--exposure-ms"
                 )
             why = "the recording states no exposures; --exposure-ms does"
             self.row("exposure", False, "each frame is taken as an instant", why, f"{DATAPARSER}.exposure_ms")
             return
+        all_frames, _ = split_frames(self.recording, replace(parser, exposure_ms=0.0), held_out=False)
+        num_left_out = len(all_frames.times) - len(frames.times)
         motion = float(np.median(exposure_motion(frames, *self._depth_range)))
         instants = self.use(name, lambda: min(max(1, round(motion / PIXELS_PER_INSTANT)), MOST_INSTANTS))
         value = f"each frame is the mean over {instants} instants" if instants > 1 else "taken as an instant"
         why = (
             f"{'set by flag; ' * (parser.exposure_ms is not None)}within {np.median(frames.exposures) * 1e-6:.3g} ms "
             f"the picture moves by {motion:.3g} pixels"
-        )
-        num_left_out = len(split_frames(self.recording, replace(parser, exposure_ms=0.0), False)[0].times) - len(
-            frames.times
         )
         if num_left_out:
             why += f"; {num_left_out} frames whose exposures reach beyond the poses are left out"

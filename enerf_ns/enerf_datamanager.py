@@ -90,8 +90,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
     """Rays of frames at each step, where the field learns from frames. None: 1024, or as the paper for enerf-paper."""
     exposure_samples: Optional[int] = None  # noqa: UP045
-    """Instants of its exposure over which a pixel of a frame is averaged; 1: it is taken as seen in the middle. None: as
-    many as the motion during the exposures needs, where they are known."""
+    """Instants of its exposure over which a pixel of a frame is averaged, of which each takes a ray; 1: it is taken as
+    seen in the middle. None: as many as the motion needs, where the exposures are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -186,7 +186,7 @@ def test_frames_none_of_which_has_poses_throughout_are_an_error_of_one_sentence(
     frames = read_recording(folder).blurred_frames
     assert frames is not None
     alone = replace(read_recording(folder), blurred_frames=frames.subset(np.array([0])))
-    with pytest.raises(RecordingError, match="reach beyond the poses.*--exposure-ms 0") as error:
+    with pytest.raises(RecordingError, match=r"reach beyond the poses.*--exposure-ms 0") as error:
         split_frames(alone, EventDataParserConfig(exposure_ms=5000.0), held_out=False)
     assert "\n" not in str(error.value)
 

@@ -89,13 +89,14 @@ def test_simulation_json_states_thresholds_response_exposure_depth_and_camera(tm
     assert recording.camera == Camera(WIDTH, HEIGHT, 21.0, 22.0, 11.5, 8.5)
     assert recording.response == "logarithm:0.01"
     assert recording.frames is not None and recording.blurred_frames is not None
-    assert recording.frames.exposures.tolist() == [0] * 3
-    assert recording.blurred_frames.exposures.tolist() == [5_000_000] * 3
+    np.testing.assert_array_equal(recording.frames.exposures, [0] * 3)
+    np.testing.assert_array_equal(recording.blurred_frames.exposures, [5_000_000] * 3)
 
 
 def test_exposures_are_not_known_without_simulation_json(tmp_path: Path):
     recording = read_recording(write_esim(tmp_path / "esim", ("images", "images_corrupted")))
-    assert recording.frames.exposures is None and recording.blurred_frames.exposures is None
+    assert recording.frames is not None and recording.frames.exposures is None
+    assert recording.blurred_frames is not None and recording.blurred_frames.exposures is None
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (1.0, np.inf), (-1.0, 1.0)])
