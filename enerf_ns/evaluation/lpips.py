@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -70,6 +70,7 @@ def _at_hand(network: Network, features: Path) -> Iterator[None]:
     """Lets torchvision find a network in its folder of downloads: these features; its classifier, unused, is zeros."""
     from torchvision.models import get_model, get_model_weights
 
+    published: Any = get_model_weights(network.model)
     weights = torch.load(features, map_location="cpu", weights_only=True)
     with torch.device("meta"):
         layers = get_model(network.model, weights=None).state_dict()
@@ -81,7 +82,7 @@ def _at_hand(network: Network, features: Path) -> Iterator[None]:
     }
     hub = torch.hub.get_dir()
     with TemporaryDirectory() as folder:
-        file = Path(folder, "checkpoints", Path(get_model_weights(network.model).DEFAULT.url).name)
+        file = Path(folder, "checkpoints", Path(published.DEFAULT.url).name)
         file.parent.mkdir()
         torch.save(state, file)
         torch.hub.set_dir(folder)

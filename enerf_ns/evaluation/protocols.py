@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -94,7 +95,8 @@ def align(
         colour_filter: Whether the sensor has a colour filter.
     """
     chosen = PROTOCOLS[protocol]
-    aligned, faults = list(rendered), [None] * len(rendered)
+    aligned = list(rendered)
+    faults: list[str | None] = [None] * len(rendered)
     parameters: dict[str, float] = {}
     finite = [number for number, image in enumerate(rendered) if image.isfinite().all()]
     columns = rendered[0].shape[-1] if chosen.each_channel or colour_filter else 1
@@ -116,8 +118,8 @@ def align(
             for name, values in correction.parameters.items():
                 names = [name + colour for colour in COLOURS] if len(values) > 1 else [name]
                 parameters |= dict(zip(names, values.tolist(), strict=True))
-    encoded = ([chosen.encode(image) for image in images] for images in (aligned, recorded))
-    return Aligned(*encoded, faults, parameters)
+    encoded = [[chosen.encode(image) for image in images] for images in (aligned, recorded)]
+    return Aligned(encoded[0], encoded[1], faults, parameters)
 
 
 def _fault(x: Pixels, y: Pixels) -> str | None:
@@ -211,8 +213,8 @@ def _gamma_affine(x: Pixels, y: Pixels) -> Correction | str:
     gamma = float(line[0])
     factors = torch.exp(of_target.mean(dim=0) - gamma * (logarithms.mean(dim=0) - mean))
     start = np.concatenate([[gamma], factors.numpy(), np.zeros(columns)])
-    exact = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12}
-    found = torch.from_numpy(least_squares(residuals, start, jacobian, method="lm", **exact).x)
+    solve: Any = least_squares  # SciPy's annotations know no function as jac
+    found = torch.from_numpy(solve(residuals, start, jacobian, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
     power, factor, shift = found[:1], found[1 : columns + 1] * torch.exp(-found[0] * mean), found[columns + 1 :]
     steepest = float((power * factor).min())
     if steepest <= 0.0:

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -161,7 +161,7 @@ def _samples(model: EnerfModel, number: int, even: bool) -> Iterator[None]:
     """Has a model take so many samples a ray: evenly, or as it was trained, with those of its proposal network in the
     same proportion."""
     before, proposal = model.sampler, model.proposal
-    sampler = copy.copy(before)
+    sampler: Any = copy.copy(before)
     if not isinstance(sampler, ProposalNetworkSampler):
         sampler.num_samples = number
     elif even:

@@ -31,7 +31,7 @@ def run(recording: Path, request: pytest.FixtureRequest) -> Run:
     geometry = run.pipeline.model.field.geometry
     geometry.init_density = 5.0
     with torch.no_grad():
-        geometry.grid.table *= 5e3
+        geometry.grid.table.mul_(5e3)
     return run
 
 
@@ -126,7 +126,7 @@ def test_pose_interpolation_is_that_of_scipy():
         spline = CubicSpline(TIMES[::keep], positions[::keep])
         turned = Slerp(TIMES[::keep], rotations[::keep])(TIMES[left_out])
         errors = np.linalg.norm(spline(TIMES[left_out]) - positions[left_out], axis=1)
-        turns = (turned.inv() * rotations[left_out]).magnitude()
+        turns = (turned.inv() * Rotation.from_quat(rotations.as_quat()[left_out])).magnitude()
         name = f"pose interpolation, one of {keep} poses"
         assert rows[name, "m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
         assert rows[name, "degrees"] == pytest.approx(np.degrees(np.sqrt(np.mean(turns**2))), rel=1e-6)
