@@ -17,7 +17,7 @@ from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import exit_with_a_sentence
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
-from enerf_ns.evaluation.metrics import Score, correlation
+from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
 from enerf_ns.evaluation.protocols import described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
@@ -113,24 +113,22 @@ class EnerfPipeline(VanillaPipeline):
         return results
 
     @torch.no_grad()
-    def event_correlation(self, num_pairs: int = 8192) -> Score:
-        """Linear correlation of rendered and measured changes of log brightness over random event pairs, or why there
-        is none.
-
-        What can be said of a field whose recording has no frames. The pairs are those of the events that are held out
-        (`held_out_events`); where none are, those of the training.
+    def event_scores(self, num_pairs: int = 8192) -> dict[str, Score]:
+        """The scores of the protocol "events", over random pairs of the events that are held out in time
+        (`held_out_events`); where none are, of the training's.
         """
         manager, sensor = self.datamanager, self.model.sensor
         sampler = manager.held_out_pair_sampler if manager.config.held_out_events else manager.pair_sampler
         if isinstance(sampler, str):
-            return sampler
+            return dict.fromkeys(EVENT_SCORES, sampler)
         self.eval()
         batch = sampler.sample(num_pairs, torch.Generator(self.device).manual_seed(0))
         rays = manager.event_rays(batch, sensor).reshape((2, num_pairs))
         start, end = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
         self.train()
         change = brightness_change(start, end, batch, sensor)
-        return correlation(change, sensor.measured_change(batch.on, batch.off, batch.pixels))
+        measured = sensor.measured_change(batch.on, batch.off, batch.pixels)
+        return event_scores(change, measured, float(sensor.mean_threshold))
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

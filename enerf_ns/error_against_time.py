@@ -228,9 +228,8 @@ class ErrorAgainstTime:
             views, summary = held_out_views(pipeline, *chosen)
             found = summary_scores(views, summary) if final else mean_scores(views)[0]
             scores = {name: score for name, score in found.items() if isinstance(score, (int, float))}
-        correlation = pipeline.event_correlation() if final else pipeline.event_correlation(PAIRS)
-        if isinstance(correlation, float):
-            scores["event_correlation"] = correlation
+        of_events = pipeline.event_scores() if final else pipeline.event_scores(PAIRS)
+        scores |= {name: score for name, score in of_events.items() if isinstance(score, float)}
         losses = {name: float(loss) for name, loss in pipeline.last_step.losses.items()}
         self._last = HistoryRow(done, self.seconds, losses, scores, len(views), self._parts, final)
         for name, score in scores.items():

@@ -200,7 +200,7 @@ def test_colour_is_learnt_from_events_and_brightness_fitted_for_each_channel(rec
         optimizer.zero_grad()
         torch.stack(list(losses.values())).sum().backward()
         optimizer.step()
-    assert pipeline.event_correlation(2048) > 0.85
+    assert pipeline.event_scores(2048)["event_correlation"] > 0.85
 
     views, _ = held_out_views(pipeline)
     shown, summary = aligned_views(views)

@@ -156,14 +156,16 @@ def test_without_held_out_events_the_correlation_is_that_of_training_pairs(recor
     drawn = []
     sample = manager.pair_sampler.sample
     manager.pair_sampler.sample = lambda *arguments: drawn.append(sample(*arguments)) or drawn[-1]
-    assert isinstance(pipeline.event_correlation(256), float) and len(drawn[0]) == 256
+    assert isinstance(pipeline.event_scores(256)["event_correlation"], float) and len(drawn[0]) == 256
     fired = torch.cat([drawn[0].start, drawn[0].end])
     assert held_out(fired, 0.2).any()
 
 
 def test_too_few_events_to_hold_out_are_a_reason_and_no_error(recording: Path, tmp_path: Path):
     pipeline = set_up(small_config(recording, tmp_path, data__held_out_events=1e-4)).pipeline
-    assert pipeline.event_correlation().startswith("no pixel fired twice, 10 events apart or less, in the time")
+    assert pipeline.event_scores()["event_correlation"].startswith(
+        "no pixel fired twice, 10 events apart or less, in the time"
+    )
 
 
 def test_tools_that_look_at_a_scene_get_pixels_of_the_train_cameras(recording: Path, tmp_path: Path):
@@ -202,7 +204,7 @@ def test_evaluation_changes_nothing_of_training(recording: Path, tmp_path: Path)
             if evaluate:
                 state = torch.get_rng_state()
                 trainer.pipeline.get_average_eval_image_metrics()
-                trainer.pipeline.event_correlation(256)
+                trainer.pipeline.event_scores(256)
                 torch.set_rng_state(state)
             found.append(trainer.train_iteration(step)[0].item())
         return found

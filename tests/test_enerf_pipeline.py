@@ -35,8 +35,8 @@ def test_losses_of_training_have_gradients_and_those_of_evaluation_have_none(pip
 
 def test_the_correlation_of_events_is_that_of_what_is_rendered(pipeline: Any):
     """Over pairs that are held out, by a generator of its own, so that it is the same each time."""
-    found = pipeline.event_correlation(300)
-    assert pipeline.event_correlation(300) == found
+    found = pipeline.event_scores(300)["event_correlation"]
+    assert pipeline.event_scores(300)["event_correlation"] == found
     pairs = pipeline.datamanager.held_out_pair_sampler.sample(300, torch.Generator().manual_seed(0))
     levels = []
     for times in (pairs.start, pairs.end):

@@ -27,6 +27,7 @@ from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.error_against_time import EARLIEST, SMALLEST_GROWTH, next_moment
 from enerf_ns.evaluation import scores as evaluation_scores
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, append_row, cut_history, read_history
+from enerf_ns.evaluation.metrics import EVENT_SCORES
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views
 
@@ -158,7 +159,7 @@ def test_a_row_holds_scores_losses_and_the_parts_of_a_step(
         assert list(row.parts) == list(parts) and row.parts == parts
         assert row.seconds == row.step * sum(parts.values())
         assert set(row.losses) == EVENTS and all(math.isfinite(loss) for loss in row.losses.values())
-        always = {"correlation", "depth_rmse", "event_correlation"}  # early on, a render may be a negative
+        always = {"correlation", "depth_rmse", *EVENT_SCORES}  # early on, a render may be a negative
         assert always <= set(row.scores) and (row.final or set(row.scores) <= always | {"psnr", "ssim"})
         for name, score in row.scores.items():
             assert put[f"Held-out/{name}", row.step] == score
@@ -167,7 +168,7 @@ def test_a_row_holds_scores_losses_and_the_parts_of_a_step(
     expected = summary_scores(views, summary)
     for name in ("psnr", "ssim", "correlation", "depth_rmse", "brightness_scale", "mean_depth"):
         assert last.scores.get(name) == expected[name]
-    assert last.scores["event_correlation"] == trainer.pipeline.event_correlation()
+    assert last.scores.items() >= trainer.pipeline.event_scores().items()
     losses = trainer.pipeline.last_step.losses
     assert last.losses == {name: loss.item() for name, loss in losses.items()}
 
@@ -201,11 +202,11 @@ def test_a_run_that_goes_on_has_one_history(recording: Path, tmp_path: Path, clo
 
 
 def test_a_run_of_events_alone_is_scored_by_them(without_frames: Path, tmp_path: Path, clock: Clock, monkeypatch):
-    monkeypatch.setattr(EnerfPipeline, "event_correlation", clock.takes(0.5, EnerfPipeline.event_correlation))
+    monkeypatch.setattr(EnerfPipeline, "event_scores", clock.takes(0.5, EnerfPipeline.event_scores))
     monkeypatch.setattr(error_against_time, "STEPS_PER_PREVIEW", 20)
     trainer = trained(config_of(without_frames, tmp_path, 50, 1.0))
     rows = read_history(trainer.base_dir)
-    assert len(rows) > 2 and all(set(row.scores) == {"event_correlation"} and row.num_frames == 0 for row in rows)
+    assert len(rows) > 2 and all(set(row.scores) == {*EVENT_SCORES} and row.num_frames == 0 for row in rows)
     (first, second) = sorted((trainer.base_dir / "previews").iterdir())
     assert (first.name, second.name) == ("step-000000020.png", "step-000000040.png")
     assert Image.open(first).size == (2 * 32, 24)

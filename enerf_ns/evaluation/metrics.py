@@ -47,6 +47,10 @@ def correlation(rendered: Float[Tensor, "*shape"], recorded: Float[Tensor, "*sha
     return float(torch.corrcoef(pixels)[0, 1])
 
 
+EVENT_SCORES = ("event_correlation", "event_rmse", "event_sign")
+"""Names of the `event_scores`."""
+
+
 def event_scores(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
 ) -> dict[str, Score]:
@@ -63,7 +67,7 @@ def event_scores(
     """
     scores: dict[str, Score] = {"event_correlation": correlation(predicted, measured)}
     if not predicted.isfinite().all():
-        return scores | dict.fromkeys(("event_rmse", "event_sign"), NOT_FINITE)
+        return dict.fromkeys(EVENT_SCORES, NOT_FINITE)
     error = (predicted - measured).double() / mean_threshold
     changed = measured != 0
     agrees = torch.sign(predicted[changed]) == torch.sign(measured[changed])

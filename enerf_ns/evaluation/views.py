@@ -37,7 +37,7 @@ class RenderingPipeline(Protocol):
     @property
     def device(self) -> Any: ...
 
-    def event_correlation(self) -> Score: ...
+    def event_scores(self) -> dict[str, Score]: ...
 
     def eval(self) -> Any: ...
 
@@ -161,7 +161,7 @@ def held_out_views(
         "fps": len(views) / seconds,
     }
     if not dataset.are_frames:
-        summary["event_correlation"] = pipeline.event_correlation()
+        summary |= pipeline.event_scores()
     else:
         depths = np.array([view.median_depth for view in views])
         summary |= held_out_numbers(manager, np.array(chosen), depths)

@@ -150,7 +150,7 @@ def test_without_frames_there_are_views_with_nothing_recorded(run_without_frames
     views, summary = held_out_views(run_without_frames.pipeline)
     assert len(views) == 3 and aligned_views(views) == (views, {})
     assert all(view.recorded is None and view.recorded_depth is None for view in views)
-    assert set(summary) == {"num_rays_per_sec", "fps", "event_correlation"}
+    assert set(summary) == {"num_rays_per_sec", "fps", "event_correlation", "event_rmse", "event_sign"}
     assert isinstance(summary["event_correlation"], float) and -1 <= summary["event_correlation"] <= 1
 
 
