@@ -61,6 +61,8 @@ class Experiment:
     """How scores are measured; what is published beside them is of the first."""
     measures: tuple[str, ...] = ()
     """Names of further `measures.MEASURES` of each run."""
+    parts: bool = False
+    """Whether the numerical errors of the parts of each run are told, too."""
     mean: bool = False
     """Whether means over the sequences are shown instead of the sequences."""
     published: Published = field(default_factory=dict)
@@ -332,6 +334,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=published.TUM_VIE,
         source="GPERT",
         notes=("Here frames and time range are those of E-NeRF's configs; GPERT's are those of Robust e-NeRF.",),
+    ),
+    "parts": Experiment(
+        "Numerical error of the parts, so that one sees which limits a result: quadrature, poses, float32, brightness fit.",
+        ("events",),
+        ("shapes", "shake-carpet1"),
+        parts=True,
     ),
     "design": Experiment(
         "What the method was chosen against, one change each, on the demo's scene or on any recording.",

@@ -31,6 +31,7 @@ from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.evaluation.history import read_history
 from enerf_ns.evaluation.lpips import NETWORKS
 from enerf_ns.evaluation.runs import method_config, set_up, train
+from enerf_ns.numerics.parts import error_of_parts
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -231,6 +232,7 @@ class Bench:
             "budget": settings.budget,
             "protocols": self.experiment.protocols,
             "vgg": "lpips_vgg" in self.experiment.columns,
+            "parts": self.experiment.parts,
             "measures": self.experiment.measures,
             "threads": torch.get_num_threads(),
             "device": device_name(),
@@ -286,6 +288,8 @@ class Bench:
             "seconds": round(run.train_seconds, 2),
             "scores": scores,
         }
+        if self.experiment.parts:
+            result["parts"] = [asdict(part) for part in error_of_parts(run)]
         return result | ({"not_scored": not_scored} if any(not_scored.values()) else {})
 
     def _config(self, cell: Cell, folder: Path) -> EnerfTrainerConfig:

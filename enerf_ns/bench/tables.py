@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from enerf_ns.bench.published import MEAN
+from enerf_ns.numerics.case import shown
 
 Results = dict[str, Any]
 """What a result file holds (`Bench.results`)."""
@@ -195,9 +196,29 @@ def remarks(results: Results) -> Iterator[str]:
 def markdown(results: Results) -> str:
     """The command, the table and what belongs to it."""
     head, content = _cells(results)
-    table = [head, ["---"] * len(head), *content]
-    printed = "\n".join(f"| {' | '.join(cells)} |" for cells in table)
-    return f"    {results['command']}\n\n{printed}\n\n" + "".join(f"* {remark}\n" for remark in remarks(results))
+    tables = [
+        _printed(head, content),
+        *([_printed(*_parts(results))] if any("parts" in run for run in results["runs"]) else []),
+    ]
+    return "\n\n".join([f"    {results['command']}", *tables, "".join(f"* {remark}\n" for remark in remarks(results))])
+
+
+def _printed(head: list[str], content: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *content])
+
+
+def _parts(results: Results) -> tuple[list[str], list[list[str]]]:
+    """Head and lines of the numerical errors of the parts of each run; of one seed of each row and sequence."""
+    runs = [run for run in results["runs"] if run["seed"] == 0 and "parts" in run]
+    lines: dict[tuple[str, str, str], list[str]] = {}
+    for place, run in enumerate(runs):
+        for part in run["parts"]:
+            cells = lines.setdefault(
+                (part["name"], part["compared"], part["unit"].partition(" at ")[0]), ["-"] * len(runs)
+            )
+            cells[place] = shown(part["error"], part["unit"])
+    head = ["part", "compared with", *(f"{run['sequence']}, {run['row']}" for run in runs)]
+    return head, [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
 
 
 def rich_table(results: Results) -> Table:
