@@ -97,7 +97,7 @@ def reconstruct(
             name = f"{network.name} ({weights.name})"
             reconstruction = NetworkReconstruction(network, name, camera.width, camera.height)
         else:
-            thresholds = recording.contrast_thresholds or 2 * (DEFAULT_CONTRAST_THRESHOLD,)
+            thresholds = recording.contrast_thresholds or (DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD)
             size, start = (camera.width, camera.height), recording.span[0]
             reconstruction = ComplementaryFilter(*size, thresholds, cutoff_frequency, start)
         times, numbers = _instants(recording, frames_per_second)
