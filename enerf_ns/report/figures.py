@@ -187,7 +187,7 @@ def shortened(name: str, length: int) -> str:
     return name if len(name) <= length else f"{name[: length // 2]}…{name[1 - length + length // 2 :]}"
 
 
-def _legend(axis: Axes, runs: Sequence[Curve], marks: Sequence[tuple[str, str, int, str, str]]) -> None:
+def _legend(axis: Axes, runs: Sequence[Curve], marks: Sequence[tuple[str, str, int, Any, str]]) -> None:
     """Runs, and what marks mean (marker, colour, size, how it is filled, words), above a plot."""
     from matplotlib.lines import Line2D
 

@@ -42,7 +42,7 @@ class Column:
     """What is shown of every view, one below the other."""
 
     title: str
-    pictures: list[np.ndarray | None]
+    pictures: Sequence[np.ndarray | None]
     """Of each view: colours in [0, 1] (height, width, 3), or values (height, width), not a number where unknown."""
     bar: str = ""
     """What the values are, with their unit."""
@@ -94,7 +94,7 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
             figure.colorbar(shown, cax=bar, orientation="horizontal", label=column.bar)
         elif column.title == "events":
             handles = [
-                Patch(facecolor=np.array(colour) / 255, edgecolor="grey", label=what)
+                Patch(facecolor="#{:02x}{:02x}{:02x}".format(*colour), edgecolor="grey", label=what)
                 for what, colour in POLARITIES.items()
             ]
             below[-1].legend(handles=handles, loc="upper center", frameon=False, fontsize=9, handlelength=1)

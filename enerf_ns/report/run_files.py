@@ -6,7 +6,7 @@ import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import yaml
 
@@ -79,6 +79,7 @@ def read_run(path: Path) -> RunFiles:
         raise RecordingError(
             f"{config_file} is a run of the method {config.method_name}; give the folder of a run of enerf."
         )
+    config = cast("EnerfTrainerConfig", config)
     folder, notes = config_file.parent, []
     history, checkpoint = [], None
     try:

@@ -58,8 +58,9 @@ def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
 def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run):
     views = shown(run)
     figure = side_by_side(views, run.pipeline.datamanager.eval_dataset.recording)
-    pictures = np.reshape([axis.images[0] for axis in figure.axes[: 7 * len(views)]], (len(views), 7))
-    for view, row in zip(views, pictures, strict=True):
+    pictures: Any = [axis.images[0] for axis in figure.axes[: 7 * len(views)]]
+    for number, view in enumerate(views):
+        row = pictures[7 * number : 7 * number + 7]
         assert view.recorded is not None and view.recorded_depth is not None
         expected = (view.rendered - view.recorded.clamp(0, 1)).mean(-1).numpy()
         np.testing.assert_allclose(row[3].get_array(), expected, atol=1e-6)
@@ -76,9 +77,9 @@ def test_the_legend_has_the_colours_of_brighter_and_darker(run: Run):
     camera = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
     picture = event_picture(EventIndex.from_events(events, 4, 3), camera, 10)
     figure = side_by_side(shown(run)[:1], run.pipeline.datamanager.eval_dataset.recording)
-    (legend,) = [axis.get_legend() for axis in figure.axes if axis.get_legend()]
+    (legend,) = [legend for axis in figure.axes if (legend := axis.get_legend())]
     colours = {
-        text.get_text(): tuple(round(255 * channel) for channel in patch.get_facecolor()[:3])
+        text.get_text(): tuple(np.round(255 * np.array(patch.get_facecolor()[:3])).astype(int).tolist())
         for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
     }
     on, off, none = (tuple(picture[1, x].tolist()) for x in (1, 2, 3))

@@ -45,8 +45,9 @@ def copy_run(run: Run, tmp_path: Path) -> CopyRun:
 
 def age(folder: Path) -> None:
     """As if training had written its files long ago."""
+    then = time.time() - 2 * run_files.RECENT_SECONDS
     for file in folder.rglob("*"):
-        os.utime(file, (time.time() - 2 * run_files.RECENT_SECONDS,) * 2)
+        os.utime(file, (then, then))
 
 
 @pytest.mark.parametrize(
