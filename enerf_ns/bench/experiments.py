@@ -336,7 +336,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=("Here frames and time range are those of E-NeRF's configs; GPERT's are those of Robust e-NeRF.",),
     ),
     "parts": Experiment(
-        "Numerical error of the parts, so that one sees which limits a result: quadrature, poses, float32, brightness fit.",
+        "Numerical error of the parts, which tells what limits a result: quadrature, poses, float32, brightness fit.",
         ("events",),
         ("shapes", "shake-carpet1"),
         parts=True,

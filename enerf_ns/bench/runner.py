@@ -126,8 +126,8 @@ class Bench:
             most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
             if not 1 <= settings.threads <= most:
                 raise FlagError(f"--threads is {settings.threads}, but must be from 1 to {most}.")
+            numba.set_num_threads(settings.threads)  # starts OpenMP, with a number of threads of its own for torch, too
             torch.set_num_threads(settings.threads)
-            numba.set_num_threads(settings.threads)
         self.output_dir = settings.output_dir.expanduser().resolve()
 
     @property

@@ -213,10 +213,8 @@ def _parts(results: Results) -> tuple[list[str], list[list[str]]]:
     lines: dict[tuple[str, str, str], list[str]] = {}
     for place, run in enumerate(runs):
         for part in run["parts"]:
-            cells = lines.setdefault(
-                (part["name"], part["compared"], part["unit"].partition(" at ")[0]), ["-"] * len(runs)
-            )
-            cells[place] = shown(part["error"], part["unit"])
+            kind = part["name"], part["compared"], part["unit"].partition(" at ")[0]
+            lines.setdefault(kind, ["-"] * len(runs))[place] = shown(part["error"], part["unit"])
     head = ["part", "compared with", *(f"{run['sequence']}, {run['row']}" for run in runs)]
     return head, [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
 
