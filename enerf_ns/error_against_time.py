@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import nerfstudio.engine.trainer  # noqa: F401 - before its writer, which would import it in a circle
 import torch
 from nerfstudio.utils import writer
 from nerfstudio.utils.colormaps import apply_depth_colormap
@@ -21,6 +22,8 @@ from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
+from enerf_ns.evaluation.lpips import lpips
+from enerf_ns.evaluation.metrics import image_metrics
 from enerf_ns.evaluation.scores import mean_scores, summary_scores
 from enerf_ns.evaluation.views import held_out_view, held_out_views, png
 from enerf_ns.terminal import StatusLine, clear_line, duration, say
@@ -39,9 +42,6 @@ STEPS_PER_PREVIEW = 500
 
 PREVIEW_WIDTH = 160
 """Pixels of the width of each picture of a preview at most."""
-
-RENDERING = 0.5
-"""What rendering a ray takes at most, as a share of a training step's time a ray."""
 
 EARLIEST = 0.01
 """Share of the training time from which on moments are spaced evenly in log time."""
@@ -129,6 +129,10 @@ class ErrorAgainstTime:
             self.seconds, self.costs = state["seconds"], state["costs"]
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
+        if self.share and self.pipeline.datamanager.eval_dataset.are_frames:
+            picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
+            image_metrics(picture, picture)
+            lpips(picture, picture)
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
@@ -195,10 +199,10 @@ class ErrorAgainstTime:
         return self.seconds + (self.num_steps - done) * median(self._durations)
 
     def _cost(self, kind: str, rays: int) -> float:
-        """Seconds that an evaluation takes: as long as those before, the first as its rays suggest."""
+        """Seconds that an evaluation takes: as long as those before, the first as long as training with its rays."""
         if self.costs[kind]:
             return mean(self.costs[kind])
-        return RENDERING * rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
+        return rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
 
     @contextmanager
     def _evaluation(self, kind: str | None = None) -> Iterator[None]:
