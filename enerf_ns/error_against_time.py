@@ -262,7 +262,7 @@ class ErrorAgainstTime:
         if self._last is not None and "psnr" in self._last.scores:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
-            parts.append(f"held out {self._last.scores['event_correlation']:.3f} at step {self._last.step}")
+            parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
         if done < self.num_steps:
             parts.append(f"{duration(self._total(done) - self.seconds)} left")
         return ", ".join(parts)
