@@ -228,8 +228,9 @@ class ErrorAgainstTime:
     def _record(self, done: int, final: bool = False) -> None:
         pipeline, scores, views = self.pipeline, {}, []
         if pipeline.datamanager.eval_dataset.are_frames:
-            chosen = () if final else (self._numbers, self._reduced_by)
-            views, summary = held_out_views(pipeline, *chosen)
+            views, summary = (
+                held_out_views(pipeline) if final else held_out_views(pipeline, self._numbers, self._reduced_by)
+            )
             found = summary_scores(views, summary) if final else mean_scores(views)[0]
             scores = {name: score for name, score in found.items() if isinstance(score, float)}
         correlation = pipeline.event_correlation() if final else pipeline.event_correlation(PAIRS)
