@@ -130,9 +130,10 @@ class ErrorAgainstTime:
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
         if self.share and self.pipeline.datamanager.eval_dataset.are_frames:
-            picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
-            image_metrics(picture, picture)
-            lpips(picture, picture)
+            with self._evaluation():
+                picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
+                image_metrics(picture, picture)
+                lpips(picture, picture)
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
