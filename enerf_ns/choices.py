@@ -286,7 +286,7 @@ class _Resolver:
         data, defaults, recording = self.config.datamanager, self.config.defaults, self.recording
         share = data.held_out_events
         value = f"{100 * share:.3g} % of the time, in {HELD_OUT_SPANS} spans" if share else ""
-        why = "their correlation is measured" if share else "the correlation of events is that of training pairs"
+        why = "what is learnt is checked by them" if share else "the correlation of events is that of training pairs"
         self.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)

@@ -168,8 +168,8 @@ class EnerfTrainerConfig(TrainerConfig):
         """Show what the recording holds and what is made of it, then store both with the run."""
         with exit_with_a_sentence():
             config = self.resolved()
-            CONSOLE.print(recording_table(config))
             resolution = config.pipeline.resolution
+            CONSOLE.print(recording_table(resolution.applied_to(config.pipeline).datamanager.dataparser))
             for line in resolution.selection:
                 CONSOLE.print(f"* {line}", highlight=False, markup=False)
             CONSOLE.print(choices_table(resolution.choices))

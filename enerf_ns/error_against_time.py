@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import nerfstudio.engine.trainer  # noqa: F401 - before its writer, which would import it in a circle
 import torch
 from nerfstudio.utils import writer
 from nerfstudio.utils.colormaps import apply_depth_colormap
@@ -21,6 +22,8 @@ from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
+from enerf_ns.evaluation.lpips import lpips
+from enerf_ns.evaluation.metrics import image_metrics
 from enerf_ns.evaluation.scores import mean_scores, summary_scores
 from enerf_ns.evaluation.views import held_out_view, held_out_views, png
 from enerf_ns.terminal import StatusLine, clear_line, duration, say
@@ -39,9 +42,6 @@ STEPS_PER_PREVIEW = 500
 
 PREVIEW_WIDTH = 160
 """Pixels of the width of each picture of a preview at most."""
-
-RENDERING = 0.5
-"""What rendering a ray takes at most, as a share of a training step's time a ray."""
 
 EARLIEST = 0.01
 """Share of the training time from which on moments are spaced evenly in log time."""
@@ -129,6 +129,11 @@ class ErrorAgainstTime:
             self.seconds, self.costs = state["seconds"], state["costs"]
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
+        if self.share and self.pipeline.datamanager.eval_dataset.are_frames:
+            with self._evaluation():
+                picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
+                image_metrics(picture, picture)
+                lpips(picture, picture)
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
@@ -195,10 +200,10 @@ class ErrorAgainstTime:
         return self.seconds + (self.num_steps - done) * median(self._durations)
 
     def _cost(self, kind: str, rays: int) -> float:
-        """Seconds that an evaluation takes: as long as those before, the first as its rays suggest."""
+        """Seconds that an evaluation takes: as long as those before, the first as long as training with its rays."""
         if self.costs[kind]:
             return mean(self.costs[kind])
-        return RENDERING * rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
+        return rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
 
     @contextmanager
     def _evaluation(self, kind: str | None = None) -> Iterator[None]:
@@ -224,8 +229,9 @@ class ErrorAgainstTime:
     def _record(self, done: int, final: bool = False) -> None:
         pipeline, scores, views = self.pipeline, {}, []
         if pipeline.datamanager.eval_dataset.are_frames:
-            chosen = () if final else (self._numbers, self._reduced_by)
-            views, summary = held_out_views(pipeline, *chosen)
+            views, summary = (
+                held_out_views(pipeline) if final else held_out_views(pipeline, self._numbers, self._reduced_by)
+            )
             found = summary_scores(views, summary) if final else mean_scores(views)[0]
             scores = {name: score for name, score in found.items() if isinstance(score, (int, float))}
         of_events = pipeline.event_scores() if final else pipeline.event_scores(PAIRS)
@@ -257,7 +263,7 @@ class ErrorAgainstTime:
         if self._last is not None and "psnr" in self._last.scores:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
-            parts.append(f"held out {self._last.scores['event_correlation']:.3f} at step {self._last.step}")
+            parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
         if done < self.num_steps:
             parts.append(f"{duration(self._total(done) - self.seconds)} left")
         return ", ".join(parts)

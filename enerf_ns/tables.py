@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from enerf_ns.choices import Choice
+from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 
-if TYPE_CHECKING:
-    from enerf_ns.enerf_trainer import EnerfTrainerConfig
 
-
-def recording_table(config: EnerfTrainerConfig) -> Table:
-    """What the recording of a resolved config holds."""
-    recording = config.recording()
+def recording_table(parser: EventDataParserConfig) -> Table:
+    """What a recording holds, and where its scene is taken to lie."""
+    recording = parser.setup().recording()
     index, camera = index_events(recording), recording.camera
     first, last = index.span
     seconds = max(last - first, 1) * 1e-9
-    parser = config.pipeline.resolution.applied_to(config.pipeline).datamanager.dataparser
     depth = parser.depth_range
     rows = {
         "folder": f"{recording.path} ({recording.format})",

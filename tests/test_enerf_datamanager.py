@@ -133,7 +133,9 @@ def held_out(times: torch.Tensor, share: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("mode", ["successor", "partner", "window"])
 def test_nothing_is_learnt_from_events_that_are_held_out(recording: Path, tmp_path: Path, mode: str):
-    changes = dict(data__pair_mode=mode, data__window_ms=20.0, data__event_pairs=5000, data__silent_pairs=5000)
+    changes: dict[str, Any] = dict(
+        data__pair_mode=mode, data__window_ms=20.0, data__event_pairs=5000, data__silent_pairs=5000
+    )
     pipeline = set_up(small_config(recording, tmp_path, data__held_out_events=0.2, **changes)).pipeline
     manager = pipeline.datamanager
     events = manager.next_batch(pipeline.model.sensor).events

@@ -109,7 +109,7 @@ def test_the_recording_may_be_named_in_any_place(recording: Path, tmp_path: Path
 def test_the_tables_name_what_there_is(recording: Path, tmp_path: Path):
     config = small_config(recording, tmp_path).resolved()
     with CONSOLE.capture() as captured:
-        CONSOLE.print(recording_table(config))
+        CONSOLE.print(recording_table(config.pipeline.datamanager.dataparser))
         CONSOLE.print(choices_table(config.pipeline.resolution.choices))
     text = captured.get()
     for expected in ("32 x 24, pinhole", "11, 32 x 24, with depth", "blurred frames", "kept", "left out"):

@@ -96,7 +96,7 @@ def test_what_is_left_out_is_counted_and_shown(folder: Path, gap, tmp_path: Path
 
     console = Console(record=True, width=200)
     Inspection.of(recording).print_tables(console)
-    console.print(recording_table(config_of(folder, tmp_path)))
+    console.print(recording_table(config_of(folder, tmp_path).pipeline.datamanager.dataparser))
     assert console.export_text().count("--keep-pose-gaps True keeps them") == 6
     (row,) = [row for row in config_of(folder, tmp_path).resolved().pipeline.resolution.choices if "gaps" in row.part]
     assert (row.part, row.kept, row.value) == ("pose gaps", False, "left out") and f"{lost:,} events (" in row.why

@@ -71,7 +71,9 @@ def test_a_view_is_reduced_to_means_over_squares_seen_from_their_middles(run: Ru
     np.testing.assert_allclose(reduced.recorded.numpy(), blocks.mean(axis=(1, 3)), atol=1e-6)
     np.testing.assert_allclose(reduced.rendered, whole.rendered[2:20:5, 2:30:5], atol=1e-4)
     np.testing.assert_allclose(reduced.depth, whole.depth[2:20:5, 2:30:5], rtol=1e-3)
-    file = run.pipeline.datamanager.eval_dataset.frames.depth_filenames[1]
+    files = run.pipeline.datamanager.eval_dataset.frames.depth_filenames
+    assert files is not None
+    file = files[1]
     depth, kept = load_array(file), file.read_bytes()
     try:
         depth[7, 11] = 0.0
