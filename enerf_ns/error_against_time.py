@@ -23,7 +23,7 @@ from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
 from enerf_ns.evaluation.lpips import lpips
-from enerf_ns.evaluation.metrics import image_metrics
+from enerf_ns.evaluation.metrics import ssim
 from enerf_ns.evaluation.scores import mean_scores, summary_scores
 from enerf_ns.evaluation.views import held_out_view, held_out_views, png
 from enerf_ns.terminal import StatusLine, clear_line, duration, say
@@ -132,7 +132,7 @@ class ErrorAgainstTime:
         if self.share and self.pipeline.datamanager.eval_dataset.are_frames:
             with self._evaluation():
                 picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
-                image_metrics(picture, picture)
+                ssim(picture, picture)
                 lpips(picture, picture)
 
     @contextmanager
@@ -233,7 +233,7 @@ class ErrorAgainstTime:
                 held_out_views(pipeline) if final else held_out_views(pipeline, self._numbers, self._reduced_by)
             )
             found = summary_scores(views, summary) if final else mean_scores(views)[0]
-            scores = {name: score for name, score in found.items() if isinstance(score, (int, float))}
+            scores = {name: float(score) for name, score in found.items() if isinstance(score, (int, float))}
         of_events = pipeline.event_scores() if final else pipeline.event_scores(PAIRS)
         scores |= {name: score for name, score in of_events.items() if isinstance(score, float)}
         losses = {name: float(loss) for name, loss in pipeline.last_step.losses.items()}

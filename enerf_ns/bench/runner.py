@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
@@ -28,8 +28,7 @@ from enerf_ns.bench.tables import csv_table, markdown
 from enerf_ns.dataparsers.errors import FlagError, OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.evaluation.history import read_history
-from enerf_ns.evaluation.lpips import NETWORKS
+from enerf_ns.evaluation.lpips import NETWORKS, Net
 from enerf_ns.evaluation.runs import method_config, set_up, train
 from enerf_ns.numerics.parts import error_of_parts
 from enerf_ns.simulator.engine import simulate
@@ -275,13 +274,10 @@ class Bench:
         """Seconds, steps and scores of a cell's run, which is in the folder afterwards."""
         config = self._config(cell, folder)
         config.max_num_iterations = steps_of(self.settings.budget, config)
-        config.steps_per_eval_image = config.steps_per_eval_batch = config.max_num_iterations + 1
         run = train(config)
-        history = read_history(folder)
-        if history:
-            run = replace(run, train_seconds=history[-1].seconds)
         assert run.train_seconds is not None
-        nets = [net for net, network in NETWORKS.items() if net == "alex" or network.score in self.experiment.columns]
+        columns = self.experiment.columns
+        nets: list[Net] = [net for net, network in NETWORKS.items() if net == "alex" or network.score in columns]
         scores, not_scored = evaluate(run, self.experiment.protocols, self.experiment.measures, nets)
         result: dict[str, Any] = {
             "steps": config.max_num_iterations,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import random
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,7 +34,7 @@ class Run:
     pipeline: EnerfPipeline
     """Pipeline with the parameters of the last checkpoint."""
     train_seconds: float | None = None
-    """Wall time (s) of the training and its set-up; None of a run that was loaded."""
+    """Time (s) of the training steps; None of a run that was loaded."""
 
 
 def method_config(
@@ -96,13 +95,13 @@ def train(config: EnerfTrainerConfig) -> Run:
     config.resolved()
     config.set_timestamp()
     config.save_config()
-    start = time.perf_counter()
+    trainer = set_up(config)
     try:
-        set_up(config).train()
+        trainer.train()
     finally:
         profiler.flush_profiler(config.logging)
-    seconds = time.perf_counter() - start
-    return replace(load(config.get_base_dir() / "config.yml"), train_seconds=seconds)
+    run = load(config.get_base_dir() / "config.yml")
+    return replace(run, train_seconds=trainer.error_against_time.seconds)
 
 
 def load(config_file: Path) -> Run:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,7 @@ def test_a_scene_of_its_own_is_written_and_simulated(tmp_path: Path, monkeypatch
 def test_measures_of_a_run(finished: Path):
     """Depths at all poses against those of `held_out_views`, once for each half of the frames."""
     (folder,) = finished.glob("runs/shapes/enerf/events-*")
-    run = runner.replace(load(folder / "config.yml"), train_seconds=3.0)
+    run = replace(load(folder / "config.yml"), train_seconds=3.0)
     assert milliseconds_a_step(run) == 1500.0
     scores, _ = evaluate(run, ["log-affine-set"], ["memory", "step"])
     found = scores["log-affine-set"]
