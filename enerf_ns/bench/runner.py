@@ -378,6 +378,7 @@ def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
     with tempfile.TemporaryDirectory() as folder:
         trial = copy.deepcopy(config)
         trial.output_dir, trial.max_num_iterations = Path(folder), LATE + WARM_UP + TIMED
+        trial.evaluation_share = 0.0
         trainer = set_up(trial)
         trainer.pipeline.train()
         start = 0.0

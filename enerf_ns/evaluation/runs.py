@@ -71,10 +71,17 @@ def method_config(
 
 
 def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:
-    """A trainer as `ns-train` makes it: random numbers seeded by `config.machine.seed`, everything set up."""
+    """A trainer as `ns-train` makes it: random numbers seeded by `config.machine.seed`, everything set up.
+
+    What Nerfstudio logs goes to this run from now on, and to none before it in this process.
+    """
+    from nerfstudio.utils import writer
+
     random.seed(config.machine.seed)
     np.random.seed(config.machine.seed)  # noqa: NPY002 - libraries draw from it
     torch.manual_seed(config.machine.seed)
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
     trainer: EnerfTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
