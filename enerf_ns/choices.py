@@ -42,6 +42,10 @@ class MethodDefaults:
     event_pairs: int = 1024
     silent_pairs: int = 341
     train_num_rays_per_batch: int = 1024
+    silent_pairs_beside_frames: int = 128
+    """Silent pairs where the field learns from frames, too, which tell of plain surfaces as well."""
+    rays_beside_events: int = 426
+    """Rays of frames where the field learns from events, too: those that silent pairs have less."""
     event_loss: str = "huber"
     no_event_loss_weight: float = 0.1
     no_event_margin: float = 0.0
@@ -325,7 +329,8 @@ class _Resolver:
         share = silent_share(index_events(self.recording), round(silence * 1e6))
         between = self.config.datamanager.silent_mode == "intervals"
         found = between or share > SMALLEST_SILENT_SHARE
-        silent_pairs = self.use(name, lambda: defaults.silent_pairs if found else 0)
+        usual = defaults.silent_pairs_beside_frames if self.use_frames else defaults.silent_pairs
+        silent_pairs = self.use(name, lambda: usual if found else 0)
         value = f"{silent_pairs} pairs a step" if silent_pairs else "they are not searched"
         why = f"pixels are silent for {silence:g} ms and longer during {100 * share:.1f} % of the time"
         if between:
@@ -392,7 +397,9 @@ class _Resolver:
     def _frames(self) -> None:
         """Whether frames are learnt from, and whether a second camera took them."""
         data, recording, name = self.config.datamanager, self.recording, "datamanager.supervision"
-        self.use("datamanager.train_num_rays_per_batch", lambda: self.config.defaults.train_num_rays_per_batch)
+        defaults = self.config.defaults
+        rays = defaults.rays_beside_events if self.use_events and self.use_frames else defaults.train_num_rays_per_batch
+        self.use("datamanager.train_num_rays_per_batch", lambda: rays)
         if not self.use_frames:
             why = f"supervision is {data.supervision}" if recording.has_frames else "the recording holds no frames"
             self.row("frame loss", False, "", why, name)

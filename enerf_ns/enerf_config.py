@@ -116,6 +116,8 @@ PAPER = MethodDefaults(
     event_pairs=30096,
     silent_pairs=0,
     train_num_rays_per_batch=30096,
+    silent_pairs_beside_frames=0,
+    rays_beside_events=30096,
     event_loss="squared",
     no_event_loss_weight=5.0,  # 1 / C at the paper's C = 0.2: its weight of 1
     no_event_margin=1.0,

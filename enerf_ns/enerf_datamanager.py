@@ -77,8 +77,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     uniform_over: Literal["pairs", "pixels"] = "pairs"
     """Draw every pair alike, or every active pixel alike."""
     silent_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, or as the
-    paper for enerf-paper. 0: silent pixels are not searched."""
+    """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, beside
+    frames 128, or as the paper for enerf-paper. 0: silent pixels are not searched."""
     silent_mode: Literal["pixels", "intervals"] = "pixels"
     """Where silent pairs lie: at any pixel while it is silent for silence-ms, or between any two successive events of a
     pixel, as in the total variation of Deblur e-NeRF."""
@@ -88,7 +88,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Share of the recording's time, in 8 equal spans spread evenly over it, at which no pair starts or ends: the
     correlation of events is measured there. 0: none, and it is measured over training pairs."""
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
-    """Rays of frames at each step, where the field learns from frames. None: 1024, or as the paper for enerf-paper."""
+    """Rays of frames at each step, where the field learns from frames. None: 1024, beside events 426, or as the paper
+    for enerf-paper."""
     exposure_samples: Optional[int] = None  # noqa: UP045
     """Instants of its exposure over which a pixel of a frame is averaged, of which each takes a ray; 1: it is taken as
     seen in the middle. None: as many as the motion needs, where the exposures are known."""

@@ -126,6 +126,19 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
     assert rows(resolution)["threshold per polarity"].why == "the recording states them"
 
 
+def test_frames_take_no_more_rays_of_a_step_than_silent_pixels_give_up(recording: Path):
+    def drawn(config, supervision: str) -> tuple[int, int]:
+        config = copy.deepcopy(config)
+        config.datamanager.supervision = supervision
+        values = resolve(config, read_recording(recording)).values
+        return values["datamanager.silent_pairs"], values["datamanager.train_num_rays_per_batch"]
+
+    alone, both = drawn(ENERF, "events"), drawn(ENERF, "events+frames")
+    assert 2 * alone[0] == 2 * both[0] + both[1] and both[1] > 0 < both[0]
+    assert drawn(ENERF, "frames") == (0, 1024)
+    assert drawn(PAPER, "events+frames") == (0, 30096)
+
+
 def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp_path: Path):
     unknown = replace(read_recording(recording), contrast_thresholds=None)
     resolution = resolve(ENERF, unknown)

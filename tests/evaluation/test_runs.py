@@ -30,9 +30,7 @@ def test_a_configuration_is_a_copy_with_changes(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["nerfacto", "nothing"])
 def test_a_method_that_is_not_of_this_package_is_refused(tmp_path: Path, name: str):
-    with pytest.raises(
-        FlagError, match=rf"no method {name} in this package; choose one of enerf, .*enerf-paper.*"
-    ):
+    with pytest.raises(FlagError, match=rf"no method {name} in this package; choose one of enerf, .*enerf-paper.*"):
         method_config(name, tmp_path, tmp_path)
 
 
