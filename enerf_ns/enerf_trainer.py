@@ -325,7 +325,8 @@ class EnerfTrainer(Trainer):
         super().eval_iteration(step)
 
     def _finish(self, step: int) -> None:
-        """Scores the run at its end, whose checkpoint is stored by then."""
+        """Scores the run at its end, whose checkpoint is stored by then; an interruption stops that at once."""
+        self._restore_signals()
         with self.train_lock:
             self.error_against_time.finish()
         writer.write_out_storage()

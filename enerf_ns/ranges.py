@@ -62,9 +62,11 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_pair_distance": (1, 10**6),
     "window_ms": (1e-6, 1e9),  # from 1 ns
     "silent_pairs": (0, MOST_DRAWS),
+    "silent_pairs_beside_frames": (0, MOST_DRAWS),
     "held_out_events": (0.0, 0.5),
     "silence_ms": (2e-6, 1e9),  # from 2 ns, which two instants need
     "train_num_rays_per_batch": (1, MOST_DRAWS),
+    "rays_beside_events": (1, MOST_DRAWS),
     "exposure_samples": (1, 4096),
     "eval_num_rays_per_batch": (1, MOST_DRAWS),
     "train_num_images_to_sample_from": (-1, 10**9),  # -1: all
