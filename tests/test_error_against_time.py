@@ -26,7 +26,7 @@ from enerf_ns.dataparsers.files import load_image
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.error_against_time import EARLIEST, SMALLEST_GROWTH, next_moment
 from enerf_ns.evaluation import scores as evaluation_scores
-from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, append_row, cut_history, read_history
+from enerf_ns.evaluation.history import HISTORY_FILE, read_history
 from enerf_ns.evaluation.metrics import EVENT_SCORES
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views
@@ -275,14 +275,3 @@ def test_a_frame_that_went_missing_ends_evaluation_and_not_training(
     output = capsys.readouterr().out
     assert output.count("is missing; an image was expected there. Training goes on without evaluation.") == 1
     assert "Training is done" in output and not read_history(trainer.base_dir)
-
-
-def test_rows_are_stored_as_they_are_and_cut_behind_a_step(tmp_path: Path):
-    rows = [HistoryRow(step, 0.5 * step, {"event_loss": 1.0 / step}, {"psnr": 20.0}, 2) for step in (1, 2, 4)]
-    rows.append(HistoryRow(5, 2.5, parts={"draw": 0.1}, final=True))
-    assert read_history(tmp_path) == cut_history(tmp_path, 3) == []
-    for row in rows:
-        append_row(tmp_path, row)
-    assert read_history(tmp_path) == rows
-    assert cut_history(tmp_path, 5) == rows[:3] == read_history(tmp_path)
-    assert cut_history(tmp_path, 3) == rows[:2] == read_history(tmp_path)
