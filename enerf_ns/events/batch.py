@@ -49,12 +49,14 @@ class EventBatch:
     def with_silent(self, silent: EventBatch) -> EventBatch:
         """A batch of these pairs, all of events, and then those of silent pixels."""
         columns = zip(self.columns, silent.columns, strict=True)
-        return EventBatch(*(torch.cat(both) for both in columns), len(silent), self.starts_at_events)
+        joined = (torch.cat(both) for both in columns)
+        return EventBatch(*joined, num_silent=len(silent), starts_at_events=self.starts_at_events)
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
-        return EventBatch(*columns, int(chosen[self.silent].sum()), self.starts_at_events)
+        num_silent = int(chosen[self.silent].sum())
+        return EventBatch(*columns, num_silent=num_silent, starts_at_events=self.starts_at_events)
 
 
 @dataclass(frozen=True)
