@@ -29,7 +29,8 @@ class HistoryRow:
     """Each term of the last step's loss, with its weight."""
     scores: dict[str, float] = field(default_factory=dict)
     """Scores by name, those that there are of psnr (dB), ssim, lpips, correlation and depth_rmse (metres) over the
-    held-out frames looked at, and the `enerf_ns.evaluation.metrics.event_scores` over held-out events."""
+    held-out frames looked at, and the `enerf_ns.evaluation.metrics.event_scores` over held-out events; at the end the
+    other numbers of `enerf_ns.evaluation.scores.summary_scores` too."""
     num_frames: int = 0
     """Held-out frames looked at."""
     parts: dict[str, float] = field(default_factory=dict)
