@@ -252,8 +252,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def event_rays(self, batch: EventBatch, sensor: SensorModel) -> RayBundle:
         """Rays of all first instants, from when the pixels can see, then of all second ones."""
-        at_events = self.config.pair_mode != "accumulated"
-        delays = sensor.blind_after(batch.start, batch.end) if at_events else None
+        delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
         if delays is not None:
             delays[batch.silent] = 0.0
             delays = torch.cat([delays, torch.zeros_like(delays)])

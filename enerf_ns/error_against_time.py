@@ -24,7 +24,8 @@ from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
 from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import ssim
-from enerf_ns.evaluation.scores import mean_scores, summary_scores
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL
+from enerf_ns.evaluation.scores import NotScored, mean_scores, summary_scores
 from enerf_ns.evaluation.views import held_out_view, held_out_views, png
 from enerf_ns.terminal import StatusLine, clear_line, duration, say
 
@@ -227,17 +228,26 @@ class ErrorAgainstTime:
             self.costs[kind].append(time.perf_counter() - begin)
 
     def _record(self, done: int, final: bool = False) -> None:
-        pipeline, scores, views = self.pipeline, {}, []
-        if pipeline.datamanager.eval_dataset.are_frames:
-            views, summary = (
-                held_out_views(pipeline) if final else held_out_views(pipeline, self._numbers, self._reduced_by)
-            )
-            found = summary_scores(views, summary) if final else mean_scores(views)[0]
-            scores = {name: float(score) for name, score in found.items() if isinstance(score, (int, float))}
-        of_events = pipeline.event_scores() if final else pipeline.event_scores(PAIRS)
-        scores |= {name: score for name, score in of_events.items() if isinstance(score, float)}
+        pipeline, views = self.pipeline, []
+        found: dict[str, Any] = {}
+        not_scored: NotScored = {}
+        if pipeline.datamanager.eval_dataset.are_frames and final:
+            views, summary = held_out_views(pipeline)
+            found = summary_scores(views, summary)
+            not_scored = found.pop("not_scored", {})
+        elif pipeline.datamanager.eval_dataset.are_frames:
+            views, _ = held_out_views(pipeline, self._numbers, self._reduced_by)
+            found, places = mean_scores(views)
+            for name, reasons in places.items():
+                not_scored[name] = {why: [self._numbers[place] for place in left] for why, left in reasons.items()}
+        protocol = found.pop("protocol", DEFAULT_PROTOCOL if views else EVENTS_PROTOCOL)
+        found |= pipeline.event_scores() if final else pipeline.event_scores(PAIRS)
+        not_scored |= {name: {why: []} for name, why in found.items() if isinstance(why, str)}
+        scores = {name: float(score) for name, score in found.items() if isinstance(score, (int, float))}
         losses = {name: float(loss) for name, loss in pipeline.last_step.losses.items()}
-        self._last = HistoryRow(done, self.seconds, losses, scores, len(views), self._parts, final)
+        self._last = HistoryRow(
+            done, self.seconds, losses, scores, len(views), self._parts, final, not_scored, protocol
+        )
         for name, score in scores.items():
             writer.put_scalar(f"Held-out/{name}", score, done)
         append_row(self.folder, self._last)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 
-from enerf_ns.sensor.response import linlog, luma
+from enerf_ns.sensor.response import Logarithm, luma
 
 
 @pytest.fixture(scope="module")
@@ -33,22 +33,26 @@ def test_losses_of_training_have_gradients_and_those_of_evaluation_have_none(pip
     assert not any(loss.requires_grad for loss in losses.values()) and pipeline.training
 
 
-def test_the_correlation_of_events_is_that_of_what_is_rendered(pipeline: Any):
-    """Over pairs that are held out, by a generator of its own, so that it is the same each time."""
-    found = pipeline.event_scores(300)["event_correlation"]
-    assert pipeline.event_scores(300)["event_correlation"] == found
+def test_the_scores_of_events_are_those_of_what_is_rendered(pipeline: Any):
+    """Over pairs that are held out, by a generator of its own, so that they are the same each time."""
+    torch.nn.init.normal_(pipeline.model.field.geometry.grid.table)  # at first nothing changes
+    found = pipeline.event_scores(300)
+    assert pipeline.event_scores(300) == found and pipeline.model.sensor.response == Logarithm(0.001)
     pairs = pipeline.datamanager.held_out_pair_sampler.sample(300, torch.Generator().manual_seed(0))
     levels = []
     for times in (pairs.start, pairs.end):
         rays = pipeline.datamanager.event_camera.rays(pairs.pixels, times)
         pipeline.eval()
         with torch.no_grad():
-            levels.append(linlog(luma(pipeline.model(rays)["rgb"])))
+            levels.append(torch.log(luma(pipeline.model(rays)["rgb"].double()) + 0.001))
         pipeline.train()
-    thresholds = pipeline.model.sensor.contrast_thresholds
-    measured = thresholds[0] * pairs.on - thresholds[1] * pairs.off
-    expected = np.corrcoef((levels[1] - levels[0]).double(), measured.double())[0, 1]
-    assert found == pytest.approx(expected, abs=1e-4)
+    c_on, c_off = pipeline.model.sensor.contrast_thresholds
+    change, measured = (levels[1] - levels[0]).numpy(), (c_on * pairs.on - c_off * pairs.off).double().numpy()
+    assert found["event_correlation"] == pytest.approx(np.corrcoef(change, measured)[0, 1], abs=1e-4)
+    error = (change - measured) / (0.5 * (c_on + c_off))
+    assert found["event_rmse"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)
+    agrees = [a * b > 0 for a, b in zip(change, measured, strict=True) if b != 0]
+    assert 0 < len(agrees) and found["event_sign"] == sum(agrees) / len(agrees)
 
 
 def test_the_config_of_a_pipeline_has_nothing_open_and_the_users_is_as_it_was(recording: Path, tmp_path: Path):

@@ -26,7 +26,7 @@ from enerf_ns.dataparsers.files import load_image
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.error_against_time import EARLIEST, SMALLEST_GROWTH, next_moment
 from enerf_ns.evaluation import scores as evaluation_scores
-from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, append_row, cut_history, read_history
+from enerf_ns.evaluation.history import HISTORY_FILE, read_history
 from enerf_ns.evaluation.metrics import EVENT_SCORES
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views
@@ -162,6 +162,12 @@ def test_a_row_holds_scores_losses_and_the_parts_of_a_step(
         assert set(row.losses) == EVENTS and all(math.isfinite(loss) for loss in row.losses.values())
         always = {"correlation", "depth_rmse", *EVENT_SCORES}  # early on, a render may be a negative
         assert always <= set(row.scores) and (row.final or set(row.scores) <= always | {"psnr", "ssim"})
+        assert row.protocol == "log-affine-set" and not set(row.scores) & set(row.not_scored)
+        for name in ("psnr", "ssim", "lpips"):
+            left_out = [number for numbers in row.not_scored.get(name, {}).values() for number in numbers]
+            looked_at = [0, 1, 2] if row.final else [0, 2]
+            assert sorted(left_out) == ([] if name in row.scores else looked_at)
+        assert "lpips" in row.not_scored, "the frames are too small for it"
         for name, score in row.scores.items():
             assert put[f"Held-out/{name}", row.step] == score
     assert {row.num_frames for row in rows} == {2} and (last.num_frames, last.final, last.step) == (3, True, 60)
@@ -208,6 +214,7 @@ def test_a_run_of_events_alone_is_scored_by_them(without_frames: Path, tmp_path:
     trainer = trained(config_of(without_frames, tmp_path, 50, 1.0))
     rows = read_history(trainer.base_dir)
     assert len(rows) > 2 and all(set(row.scores) == {*EVENT_SCORES} and row.num_frames == 0 for row in rows)
+    assert {row.protocol for row in rows} == {"events"} and not any(row.not_scored for row in rows)
     (first, second) = sorted((trainer.base_dir / "previews").iterdir())
     assert (first.name, second.name) == ("step-000000020.png", "step-000000040.png")
     assert Image.open(first).size == (2 * 32, 24)
@@ -275,14 +282,3 @@ def test_a_frame_that_went_missing_ends_evaluation_and_not_training(
     output = capsys.readouterr().out
     assert output.count("is missing; an image was expected there. Training goes on without evaluation.") == 1
     assert "Training is done" in output and not read_history(trainer.base_dir)
-
-
-def test_rows_are_stored_as_they_are_and_cut_behind_a_step(tmp_path: Path):
-    rows = [HistoryRow(step, 0.5 * step, {"event_loss": 1.0 / step}, {"psnr": 20.0}, 2) for step in (1, 2, 4)]
-    rows.append(HistoryRow(5, 2.5, parts={"draw": 0.1}, final=True))
-    assert read_history(tmp_path) == cut_history(tmp_path, 3) == []
-    for row in rows:
-        append_row(tmp_path, row)
-    assert read_history(tmp_path) == rows
-    assert cut_history(tmp_path, 5) == rows[:3] == read_history(tmp_path)
-    assert cut_history(tmp_path, 3) == rows[:2] == read_history(tmp_path)

@@ -25,6 +25,8 @@ class EventBatch:
     """Number of negative events of each pair, after the first instant and up to and with the second."""
     num_silent: int = 0
     """Number of pairs of silent pixels, whose instants are any between two of their events; they come last."""
+    starts_at_events: bool = True
+    """Whether the pairs of events begin at events, after which pixels may be blind; windows of time do not."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -47,12 +49,14 @@ class EventBatch:
     def with_silent(self, silent: EventBatch) -> EventBatch:
         """A batch of these pairs, all of events, and then those of silent pixels."""
         columns = zip(self.columns, silent.columns, strict=True)
-        return EventBatch(*(torch.cat(both) for both in columns), num_silent=len(silent))
+        joined = (torch.cat(both) for both in columns)
+        return EventBatch(*joined, num_silent=len(silent), starts_at_events=self.starts_at_events)
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
-        return EventBatch(*columns, num_silent=int(chosen[self.silent].sum()))
+        num_silent = int(chosen[self.silent].sum())
+        return EventBatch(*columns, num_silent=num_silent, starts_at_events=self.starts_at_events)
 
 
 @dataclass(frozen=True)

@@ -340,7 +340,7 @@ class AccumulationSampler:
         if fired.shape[1]:
             fired = fired[:, torch.arange(batch_size - negatives, device=fired.device) % fired.shape[1]]
         pixels, start, end, on, off = torch.cat([fired, negative], dim=1)
-        return EventBatch(pixels, start, end, on, off)
+        return EventBatch(pixels, start, end, on, off, starts_at_events=False)
 
     def _windows(self, draws: int, generator: torch.Generator) -> Int64[Tensor, "5 windows"]:
         """Pixels, starts, ends, on and off events of windows of any length but 0 at any pixel; at most `draws`."""

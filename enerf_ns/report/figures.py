@@ -19,9 +19,12 @@ SCORES = {
     "psnr": "PSNR, dB",
     "ssim": "SSIM",
     "lpips": "LPIPS",
+    "lpips_vgg": "LPIPS (VGG)",
     "correlation": "correlation",
     "depth_rmse": "depth RMSE, m",
     "event_correlation": "event correlation",
+    "event_rmse": "event RMSE, thresholds",
+    "event_sign": "event sign, share",
 }
 """What is said of each score on an axis, with its unit."""
 
@@ -63,13 +66,15 @@ def style(number: int) -> dict[str, Any]:
 
 def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) -> Figure | None:
     """Each score that any run has against training time or steps, on a logarithmic axis; None where no run has any.
+    Where any run has frames, the correlation stands for all scores of events.
 
     Scores over a few frames are joined by a line; those over all frames, at the end of a run, are larger, and apart.
     """
     from matplotlib.figure import Figure
 
     drawn = [row for run in runs for row in run.history if getattr(row, axis_of) > 0]
-    names = [name for name in SCORES if any(name in row.scores for row in drawn)]
+    left_out = ("event_rmse", "event_sign") if any(row.num_frames for row in drawn) else ()
+    names = [name for name in SCORES if name not in left_out and any(name in row.scores for row in drawn)]
     if not names:
         return None
     figure = Figure(figsize=(WIDTH, 0.7 + 1.7 * len(names) + 0.2 * len(runs)), layout="constrained", dpi=150)
@@ -97,8 +102,8 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
 def work_precision(runs: Sequence[Curve]) -> Figure | None:
     """Error against training time, one point a run, with the Pareto front; None where fewer than two runs have both.
 
-    Of PSNR the error is the RMS error of brightness, 10^(-PSNR / 20); of depth its RMSE; without frames, what the
-    correlation of events lacks of 1.
+    Of PSNR the error is the RMS error of brightness, 10^(-PSNR / 20); of depth its RMSE; of events what their
+    correlation lacks of 1.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter

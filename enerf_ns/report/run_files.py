@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -13,7 +12,7 @@ import yaml
 from enerf_ns.checkpoints import newest_checkpoint
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import reading
-from enerf_ns.evaluation.history import HistoryRow, read_history
+from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
 
 if TYPE_CHECKING:
     from enerf_ns.enerf_trainer import EnerfTrainerConfig
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 RECENT_SECONDS = 600.0
 """Age (s) of the newest file that training wrote, up to which a run that is not at its end counts as still going."""
 
-WRITTEN_BY_TRAINING = ("config.yml", "history.jsonl", "events.out.*", "previews/*", "nerfstudio_models/*")
+WRITTEN_BY_TRAINING = ("config.yml", HISTORY_FILE, "events.out.*", "previews/*", "nerfstudio_models/*")
 """Patterns of the files that training writes into the folder of a run."""
 
 
@@ -32,7 +31,7 @@ class RunFiles:
     config_file: Path
     config: EnerfTrainerConfig
     history: list[HistoryRow]
-    """Oldest row first, with finite numbers alone; empty where the run has none."""
+    """Oldest row first; empty where the run has none."""
     steps: int
     """Training steps done, as far as the files know."""
     stored: int
@@ -61,7 +60,7 @@ def read_run(path: Path) -> RunFiles:
         path: The folder of the run, or its config.yml.
 
     Raises:
-        RecordingError: It is no run, or one of a method of another package.
+        RecordingError: It is no run, or one of a method of another package, or its files cannot be read.
     """
     from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.engine.trainer import TrainerConfig
@@ -80,13 +79,9 @@ def read_run(path: Path) -> RunFiles:
             f"{config_file} is a run of the method {config.method_name}; give the folder of a run of enerf."
         )
     config = cast("EnerfTrainerConfig", config)
-    folder, notes = config_file.parent, []
-    history, checkpoint = [], None
-    try:
-        with reading(folder / "history.jsonl", "the history of a run"):
-            history = [_finite(row) for row in read_history(folder)]
-    except RecordingError as error:
-        notes.append(str(error))
+    folder, notes, checkpoint = config_file.parent, [], None
+    with reading(folder / HISTORY_FILE, "the history of a run"):
+        history = read_history(folder)
     try:
         checkpoint = newest_checkpoint(folder / "nerfstudio_models")
     except RecordingError as error:
@@ -96,25 +91,6 @@ def read_run(path: Path) -> RunFiles:
     state = _state(config, history, stored, time.time() - max(written))
     steps = max([stored, *(row.step for row in history)])
     return RunFiles(config_file, config, history, steps, stored, state, tuple(notes))
-
-
-def _finite(row: HistoryRow) -> HistoryRow:
-    """The row without what is no number.
-
-    Raises:
-        ValueError: Its step or its time is none.
-    """
-
-    def numbers(values: dict[str, float]) -> dict[str, float]:
-        return {
-            name: float(value)
-            for name, value in values.items()
-            if isinstance(value, (int, float)) and math.isfinite(value)
-        }
-
-    if not isinstance(row.step, int) or not math.isfinite(row.seconds):
-        raise ValueError(f"a row with step {row.step!r} after {row.seconds!r} s")
-    return replace(row, losses=numbers(row.losses), scores=numbers(row.scores), parts=numbers(row.parts))
 
 
 def _state(config: EnerfTrainerConfig, history: list[HistoryRow], stored: int, age: float) -> str:

@@ -15,9 +15,6 @@ from enerf_ns.report.trade_offs import seconds_to_reach
 NONE = "-"
 """Cell of what there is not."""
 
-DIGITS = {"psnr": ".2f", "depth_rmse": ".3f", "ssim": ".3f", "lpips": ".3f"}
-"""How scores are written; .3f where nothing is said."""
-
 
 @dataclass(frozen=True)
 class Table:
@@ -38,7 +35,7 @@ class Table:
 
 def score_cell(name: str, value: object) -> str:
     """A score as text."""
-    return format(value, DIGITS.get(name, ".3f")) if isinstance(value, (int, float)) else NONE
+    return format(value, ".2f" if name == "psnr" else ".3f") if isinstance(value, (int, float)) else NONE
 
 
 def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Sequence[float]) -> Table:
@@ -80,9 +77,9 @@ def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
 
 
 def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
-    """Every row of every history; cells are empty where a row has no such score or loss."""
+    """Every row of every history, with its `SCORES`; cells are empty where a row has no such score or loss."""
     rows = [(name, row) for name, history in runs for row in history]
-    scores = list(dict.fromkeys([*SCORES, *(score for _, row in rows for score in row.scores)]))
+    scores = [name for name in SCORES if name != "lpips_vgg" or any(name in row.scores for _, row in rows)]
     losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
     content = io.StringIO()
     writer = csv.writer(content, lineterminator="\n")

@@ -17,6 +17,7 @@ import numpy as np
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS, described
 from enerf_ns.evaluation.runs import Run, load
@@ -182,12 +183,13 @@ def _writing_to(folder: Path) -> Iterator[None]:
 def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring, video: bool) -> None:
     """Fills in scores, pictures and video of a run, as far as they can be had."""
     history = one.files.history
-    scored = next((row for row in reversed(history) if row.scores), None)
+    scored = next((row for row in reversed(history) if row.scores or row.not_scored), None)
     at_end = bool(scored and scored.final)
     if scored:
         one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
-        one.scores = dict.fromkeys(("psnr", "ssim", "lpips")) | scored.scores
-        one.protocol = DEFAULT_PROTOCOL if scored.num_frames else EVENTS_PROTOCOL
+        one.scores = {**dict.fromkeys(("psnr", "ssim", "lpips")), **scored.scores}
+        one.scores |= {"not_scored": scored.not_scored} if scored.not_scored else {}
+        one.protocol = scored.protocol or _earlier_protocol(one.files, scored)
     else:
         one.step = one.files.steps
     if run is None:
@@ -200,7 +202,8 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         views, summary = held_out_views(run.pipeline, None if anew else shown)
         stored = int(run.config.load_step or 0) + 1
         if anew:
-            one.step, one.num_frames, one.over_all_frames = stored, len(views), True
+            one.step, one.over_all_frames = stored, True
+            one.num_frames = sum(view.recorded is not None for view in views)
             one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
             one.protocol = one.scores.pop("protocol")
             views = [views[number] for number in shown]
@@ -225,8 +228,15 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         _take_preview(one)
     if history:
         one.seconds = float(np.interp(one.step, [row.step for row in history], [row.seconds for row in history]))
-    elif run is not None and run.train_seconds is not None:
-        one.seconds = round(run.train_seconds, 1)
+    elif run is not None:
+        one.seconds = run.train_seconds
+
+
+def _earlier_protocol(files: RunFiles, row: HistoryRow) -> str:
+    """The protocol of a row of an earlier version, which named none."""
+    if not row.num_frames:
+        return EVENTS_PROTOCOL
+    return "log-affine-set" if "events" in files.config.pipeline.datamanager.supervision else "raw"
 
 
 def _loaded(one: _Reported) -> Run | None:
@@ -305,7 +315,7 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
             "scored after": f"{one.step:,} steps" if one.scores else NONE,
             "training": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
             **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
-            "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.scores else NONE,
+            "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.num_frames else NONE,
             "of them on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
             "protocol": one.protocol if one.scores else NONE,
         }

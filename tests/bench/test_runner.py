@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def python_interrupts() -> Iterator[None]:
+    """Also where these tests run in the background, whose processes ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture
@@ -95,6 +104,7 @@ def test_what_was_made_with_other_settings_is_run_again(finished: Path, changes:
     assert bench(finished)._folder(run.cells[0]).exists()
 
 
+@pytest.mark.usefixtures("python_interrupts")
 def test_a_bench_that_is_stopped_between_rows_and_inside_of_one_ends_with_the_same_table(
     finished: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch
 ):

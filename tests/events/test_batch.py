@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
@@ -22,6 +25,12 @@ def test_a_subset_knows_which_of_its_pairs_are_silent():
     joined = events(3, 0, False).with_silent(events(2, 100, True))
     subset = joined.subset(torch.tensor([True, False, True, False, True]))
     assert subset.pixels[subset.fired].tolist() == [0, 2] and subset.off[subset.silent].tolist() == [105]
+
+
+@pytest.mark.parametrize("at_events", [True, False])
+def test_a_batch_knows_whether_its_pairs_begin_at_events_whatever_becomes_of_it(at_events: bool):
+    joined = replace(events(3, 0, False), starts_at_events=at_events).with_silent(events(2, 100, True))
+    assert joined.starts_at_events == joined.subset(joined.off > 4).starts_at_events == at_events
 
 
 def frames_of(pixels: int, instants: int) -> FrameBatch:

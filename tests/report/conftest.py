@@ -27,8 +27,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def run(recording: Path) -> Run:
-    """Of two steps."""
-    return train(method_config("enerf", recording, recording.parent / "runs", SMALL))
+    """Of two steps, without a history."""
+    return train(method_config("enerf", recording, recording.parent / "runs", {**SMALL, "evaluation_share": 0.0}))
 
 
 @pytest.fixture(scope="session")
@@ -36,5 +36,6 @@ def run_without_frames(recording: Path) -> Run:
     """The same of events alone."""
     folder = recording.with_name("without_frames")
     shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
-    changes = {**SMALL, "pipeline.datamanager.dataparser.held_out_every": 16}
+    held_out = {"pipeline.datamanager.dataparser.held_out_every": 16, "pipeline.datamanager.held_out_events": 0.2}
+    changes = {**SMALL, **held_out, "evaluation_share": 0.0}
     return train(method_config("enerf", folder, recording.parent / "runs", changes))

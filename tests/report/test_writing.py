@@ -16,15 +16,20 @@ import pytest
 import torch
 import yaml
 from PIL import Image
+from small_runs import SMALL
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.enerf_model import EnerfModel
 from enerf_ns.evaluation.history import HistoryRow, append_row
+from enerf_ns.evaluation.metrics import EVENT_SCORES
 from enerf_ns.evaluation.protocols import described
-from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.runs import Run, method_config, train
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.report import writing
+from enerf_ns.report.figures import Curve, error_against
 from enerf_ns.report.pictures import camera_path
+from enerf_ns.report.tables import history_csv
 from enerf_ns.report.writing import Scoring, write_report
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -129,7 +134,8 @@ def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_
     assert json.loads((folder / "scores.json").read_text()) == entries
     (scores,) = entries.values()
     assert list(entries) == [run.config.experiment_name]
-    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "brightness_scale", "fps"} <= set(scores)
+    assert {"psnr", "ssim", "correlation", "depth_rmse", "mean_depth", "fps"} <= set(scores)
+    assert ("brightness_scale" in scores) == (scores["psnr"] is not None) == ("psnr" not in scores["not_scored"])
     assert scores["train_seconds"] > 0 and scores["lpips"] is None and scores["events"] > 0
     assert (scores["state"], scores["step"], scores["num_frames"], scores["over_all_frames"]) == ("done", 2, 3, True)
     assert json.loads((folder / "camera_path.json").read_text()) == camera_path(
@@ -211,7 +217,7 @@ def test_the_csv_has_each_row_of_each_run(moved: Path, crashed: Path, tmp_path: 
     rows = rows_of(tmp_path / "report")
     assert list(rows[0]) == [
         "run", "seconds", "step", "psnr", "ssim", "lpips", "correlation", "depth_rmse", "event_correlation",
-        "num_frames", "event_loss",
+        "event_rmse", "event_sign", "num_frames", "event_loss",
     ]  # fmt: skip
     expected = [("moved", row) for row in history()] + [("crashed", row) for row in history(False, -1.5)]
     assert len(rows) == len(expected)
@@ -220,6 +226,31 @@ def test_the_csv_has_each_row_of_each_run(moved: Path, crashed: Path, tmp_path: 
         assert (float(found["seconds"]), int(found["step"]), int(found["num_frames"])) == (row.seconds, row.step, 3)
         assert float(found["psnr"]) == row.scores["psnr"] and float(found["depth_rmse"]) == row.scores["depth_rmse"]
         assert float(found["event_loss"]) == row.losses["event_loss"]
+
+
+def test_the_csv_has_lpips_of_vgg_where_there_is_some_and_no_number_that_is_no_score():
+    """Of what a run's last row has, rendering speed, fits and places are for scores.json."""
+    other = {"fps": 3.0, "mean_depth": 2.0, "brightness_scale": 1.0, "held_out_on_path": 3.0}
+    one = HistoryRow(1, 2.0, {"event_loss": 0.5}, {"psnr": 9.0, **other}, 3)
+    two = HistoryRow(2, 4.0, {"frame_loss": 0.25}, {"lpips_vgg": 0.75, "event_sign": 0.5}, 3)
+    scores = ["psnr", "ssim", "lpips", "correlation", "depth_rmse", "event_correlation", "event_rmse", "event_sign"]
+    lines = history_csv([("a", [one])]).splitlines()
+    assert lines == [f"run,seconds,step,{','.join(scores)},num_frames,event_loss", "a,2.0,1,9.0,,,,,,,,3,0.5"]
+    header, first, second = history_csv([("a", [one]), ("b", [two])]).splitlines()
+    scores.insert(3, "lpips_vgg")
+    assert header == f"run,seconds,step,{','.join(scores)},num_frames,event_loss,frame_loss"
+    assert (first, second) == ("a,2.0,1,9.0,,,,,,,,,3,0.5,", "b,4.0,2,,,,0.75,,,,,0.5,3,,0.25")
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "shown"),
+    [(0, {"event correlation", "event RMSE, thresholds", "event sign, share"}), (3, {"event correlation"})],
+)
+def test_beside_frames_the_plots_show_of_events_the_correlation_alone(num_frames: int, shown: set[str]):
+    scores = {"event_correlation": 0.5, "event_rmse": 1.5, "event_sign": 0.75}
+    rows = [HistoryRow(step, float(step), scores=scores, num_frames=num_frames) for step in (1, 2)]
+    figure = error_against("step", [Curve("a", rows, 2.0, scores, True)])
+    assert figure is not None and {axis.get_ylabel() for axis in figure.axes} == shown
 
 
 def test_the_tables_tell_the_time_to_reach_and_the_parts_of_a_step(moved: Path, crashed: Path, tmp_path: Path):
@@ -318,7 +349,7 @@ def test_a_browser_shows_the_page(moved: Path, crashed: Path, run: Run, tmp_path
     assert seen["page"] <= seen["width"] and seen["rows"] == 5 + 4 + 4 + 3
 
 
-@pytest.mark.parametrize(
+CHANGES = pytest.mark.parametrize(
     ("output", "change"),
     [
         ("rgb", lambda rgb: 1.0 - rgb),
@@ -330,6 +361,10 @@ def test_a_browser_shows_the_page(moved: Path, crashed: Path, run: Run, tmp_path
     ],
     ids=["negative", "dark", "nan", "inf", "nan depth", "no depth"],
 )
+"""What a field may come to show."""
+
+
+@CHANGES
 @pytest.mark.parametrize("every", [1, 2])
 def test_whatever_a_field_shows_the_report_is_whole_and_json(
     run: Run, tmp_path: Path, monkeypatch, output: str, change: Any, every: int
@@ -354,3 +389,55 @@ def test_whatever_a_field_shows_the_report_is_whole_and_json(
         assert (table.get(name) is None) == (left_out == [0, 1, 2])
         assert len(set(left_out)) == len(left_out)
     assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
+
+
+@CHANGES
+def test_the_end_of_a_run_is_told_by_its_history_as_by_its_checkpoint(
+    recording: Path, tmp_path: Path, monkeypatch, output: str, change: Any
+):
+    """With what has no score, and why."""
+    rendered = EnerfModel.get_outputs_for_camera_ray_bundle
+
+    def outputs(self: EnerfModel, rays: Any) -> dict[str, torch.Tensor]:
+        made = rendered(self, rays)
+        return made | {output: change(made[output])}
+
+    monkeypatch.setattr(EnerfModel, "get_outputs_for_camera_ray_bundle", outputs)
+    run = train(method_config("enerf", recording, tmp_path / "runs", SMALL))
+    (by_history,) = write_report([run], tmp_path / "history", video=False).values()
+    (run.config_file.parent / "history.jsonl").unlink()
+    (by_checkpoint,) = write_report([run], tmp_path / "checkpoint", video=False).values()
+    of_events = set(EVENT_SCORES)  # which the end of a run has beside those of frames
+    assert set(by_history) - of_events == set(by_checkpoint)
+    for name in set(by_checkpoint) - {"fps", "num_rays_per_sec", "train_seconds", "not_scored"}:
+        value = by_checkpoint[name]
+        assert by_history[name] == (pytest.approx(value, rel=1e-4) if isinstance(value, float) else value), name
+    told = {name: reasons for name, reasons in by_history["not_scored"].items() if name not in of_events}
+    assert told == by_checkpoint["not_scored"] and "lpips" in told
+    text, page = ((tmp_path / "history" / name).read_text() for name in ("report.md", "report.html"))
+    for name, reasons in by_history["not_scored"].items():
+        assert f"No {name}" in text and f"No {name}" in page and all(reason in text for reason in reasons)
+    scores = (tmp_path / "history" / "scores.json").read_text()
+    assert json.loads(scores, parse_constant=lambda name: pytest.fail(name))
+
+
+@pytest.mark.parametrize(
+    ("row", "supervision", "protocol"),
+    [
+        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3, protocol="gamma-affine"), "events", "gamma-affine"),
+        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "events", "log-affine-set"),
+        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "events+frames", "log-affine-set"),
+        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "frames", "raw"),
+        (HistoryRow(2, 1.0, {}, {"event_correlation": 0.5}), "events", "events"),
+    ],
+)
+def test_a_row_says_how_it_is_scored_or_is_of_an_earlier_version(
+    run: Run, tmp_path: Path, row: HistoryRow, supervision: str, protocol: str
+):
+    folder = copied(run, tmp_path / "run", [row], stored=False)
+    file = folder / "config.yml"
+    config = yaml.load(file.read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.supervision = supervision
+    file.write_text(yaml.dump(config))
+    (entry,) = write_report([folder], tmp_path / "report").values()
+    assert entry["protocol"] == protocol and described(protocol) in (tmp_path / "report" / "report.md").read_text()
