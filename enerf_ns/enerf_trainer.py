@@ -330,6 +330,9 @@ class EnerfTrainer(Trainer):
         with self.train_lock:
             self.error_against_time.finish()
         writer.write_out_storage()
+        for log in writer.EVENT_WRITERS:
+            if isinstance(log, writer.TensorboardWriter):
+                log.tb_writer.flush()
 
     def _is_finite(self) -> bool:
         """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
