@@ -139,6 +139,20 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+def fill_page(template: Path, **values: Any) -> str:
+    """A page of HTML from a Jinja template, in which values are escaped and a missing one is an error."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    templates = Environment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return templates.get_template(template.name).render(**values)
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a file so that it is whole or not there, or as it was before.
 

@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.event_index import event_picture
-from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.files import fill_page, load_image
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import (
     EventStatistics,
@@ -173,16 +173,8 @@ class Inspection:
 
     def page(self) -> str:
         """One HTML file with all pictures in it, which loads nothing."""
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-        templates = Environment(
-            loader=FileSystemLoader(Path(__file__).parent),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        return templates.get_template("inspection.html").render(
+        return fill_page(
+            Path(__file__).with_name("inspection.html"),
             name=self.recording.path.name,
             path=self.recording.path,
             problems=self.problems,

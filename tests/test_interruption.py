@@ -18,6 +18,8 @@ from small_runs import set_up, small_config
 
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 STEPS = 6
 
 
@@ -75,14 +77,6 @@ def same(one: Any, other: Any, where: str = "") -> None:
             same(*values, f"{where}.{place}")
     else:
         assert one == other, where
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("by", ["signal", "kill"])

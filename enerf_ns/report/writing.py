@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.files import write_together
+from enerf_ns.dataparsers.files import fill_page, write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.evaluation.lpips import Net
@@ -361,15 +361,6 @@ def _not_scored(one: _Reported) -> list[str]:
 
 def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, tuple[str, bytes]]) -> str:
     """One HTML file with all pictures in it, which loads nothing but videos that are too large for it."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     runs = []
     for one in reported:
         video = None
@@ -385,7 +376,8 @@ def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[
                 "video": video,
             }
         )
-    return templates.get_template("report.html").render(
+    return fill_page(
+        Path(__file__).with_name("report.html"),
         title=_title(reported),
         tables=tables,
         figures=[{"title": title, "uri": _data_uri("image/png", content)} for title, content in figures.values()],

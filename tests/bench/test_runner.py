@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from small_runs import SMALL_BENCH
 
 from enerf_ns.bench import runner
@@ -28,13 +27,7 @@ from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.runs import load, method_config
 from enerf_ns.evaluation.views import held_out_views
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture
