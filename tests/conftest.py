@@ -6,6 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
+
+# without a GPU, kernels of Triton run as NumPy; Triton reads this when it is imported
+os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -37,8 +41,6 @@ def shared_data() -> Path:
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """PyTorch adds up numbers in the same order."""
-    import torch
-
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -48,11 +50,8 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request: pytest.FixtureRequest) -> str:
     """Each device that the machine may have."""
-    if request.param == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            pytest.skip("no CUDA device")
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
     return request.param
 
 

@@ -1,7 +1,7 @@
 """Multiresolution hash grid (Müller et al., Instant Neural Graphics Primitives, SIGGRAPH 2022, section 3).
 
-One layout of parameters, two backends that compute the same function: `hash_grid` below in plain PyTorch, which runs on
-any device and is the test oracle, and `enerf_ns.encodings.hash_grid_numba`, compiled on first use, for the CPU.
+One layout of parameters, and backends that compute the same function: `hash_grid` below in plain PyTorch, which runs on
+any device and is the test oracle, and those of `BACKENDS`, compiled on first use, for the CPU and for the GPU.
 """
 
 from __future__ import annotations
@@ -9,15 +9,14 @@ from __future__ import annotations
 import functools
 import importlib
 import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-
-Backend = Literal["auto", "torch", "numba"]
 
 
 def hash_grid(
@@ -57,11 +56,71 @@ def hash_grid(
 
 
 @functools.cache
-def _numba_kernels() -> ModuleType | None:
+def _module(name: str) -> ModuleType | None:
     try:
-        return importlib.import_module("enerf_ns.encodings.hash_grid_numba")
+        return importlib.import_module(name)
     except ImportError:
         return None
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to compute the hash grid."""
+
+    package: str
+    """What it is compiled with, which may be missing."""
+    module: str
+    """Module of its function `hash_grid`, and of DEVICE, the type of the device whose tensors that takes."""
+    device: str
+    """Type of the device on which "auto" takes it; elsewhere its module is not even imported."""
+    features: tuple[int, ...]
+    """Features per level that it knows."""
+
+    def misfit(self, x: Tensor, table: Tensor) -> str | None:
+        """What it needs that these positions and this table are not; None where it can take them."""
+        module = _module(self.module)
+        if module is None:
+            return f"the package {self.package}, which cannot be imported"
+        if table.shape[1] not in self.features:
+            return f"{', '.join(map(str, self.features))} features per level, not {table.shape[1]}"
+        if not x.device.type == table.device.type == module.DEVICE or not x.dtype == table.dtype == torch.float32:
+            return (
+                f"positions and table in float32 on the device {module.DEVICE}, not {x.dtype} on {x.device} and "
+                f"{table.dtype} on {table.device}"
+            )
+        return None
+
+
+BACKENDS: dict[str, Backend] = {
+    "triton": Backend("triton", "enerf_ns.encodings.hash_grid_triton", "cuda", (1, 2, 4, 8)),
+    "numba": Backend("numba", "enerf_ns.encodings.hash_grid_numba", "cpu", (2,)),
+}
+"""Backends by name, beside "torch", which is `hash_grid` and fits everything."""
+
+
+def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """The function of a backend, for some positions and a table.
+
+    Args:
+        name: "torch", one of `BACKENDS`, or "auto": of these the first that fits, else "torch".
+        x: positions, shape (*batch, 3).
+        table: rows, shape (levels * T, features).
+
+    Raises:
+        ValueError: The backend that is named does not fit.
+    """
+    asked = [
+        found
+        for found, backend in BACKENDS.items()
+        if name == found or (name == "auto" and x.device.type == backend.device)
+    ]
+    for found in asked:
+        misfit = BACKENDS[found].misfit(x, table)
+        if misfit is None:
+            return importlib.import_module(BACKENDS[found].module).hash_grid
+        if name != "auto":
+            raise ValueError(f'backend "{name}" needs {misfit}; use "auto"')
+    return hash_grid
 
 
 class HashGrid(nn.Module):
@@ -79,11 +138,10 @@ class HashGrid(nn.Module):
         log2_table_size: each level has 2**log2_table_size rows.
         features_per_level: numbers in one row.
         init_scale: the table starts uniform in [-init_scale, init_scale).
-        backend: "torch", "numba" (float32 on the CPU, two features per level), or "auto", which is "numba" where that
-            can run and "torch" elsewhere.
+        backend: as of `fitting`; chosen at each call.
 
     Raises:
-        ValueError: for an unknown backend, or "numba" with other than two features per level.
+        ValueError: for an unknown backend.
     """
 
     scalings: Tensor
@@ -96,14 +154,12 @@ class HashGrid(nn.Module):
         log2_table_size: int = 19,
         features_per_level: int = 2,
         init_scale: float = 1e-4,
-        backend: Backend = "auto",
+        backend: str = "auto",
     ) -> None:
         super().__init__()
-        if backend not in ("auto", "torch", "numba"):
-            raise ValueError(f'backend is "{backend}", but must be "auto", "torch" or "numba"')
-        if backend == "numba" and features_per_level != 2:
-            raise ValueError(f'backend "numba" needs 2 features per level, not {features_per_level}; use "auto"')
-        self.backend: Backend = backend
+        if backend not in ("auto", "torch", *BACKENDS):
+            raise ValueError(f'backend is "{backend}", but must be auto, torch, {" or ".join(BACKENDS)}')
+        self.backend = backend
         self.out_dim = num_levels * features_per_level
         growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
         scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as Nerfstudio does
@@ -115,24 +171,9 @@ class HashGrid(nn.Module):
         """Encodes positions in [0, 1]; slightly outside, the lattice goes on.
 
         Raises:
-            ValueError: if the last axis of `x` is not 3, or if backend "numba" is asked for and `x` or the table is not
-                float32 on the CPU.
+            ValueError: if the last axis of `x` is not 3, or if the backend that is asked for does not fit `x` and the
+                table.
         """
         if x.shape[-1] != 3:
             raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")
-        fits_numba = (
-            x.device.type == self.table.device.type == "cpu"
-            and x.dtype == self.table.dtype == torch.float32
-            and self.table.shape[1] == 2
-        )
-        if self.backend == "numba":
-            if not fits_numba:
-                raise ValueError(
-                    f'backend "numba" needs positions and table in float32 on the CPU, not {x.dtype} on {x.device} and '
-                    f'{self.table.dtype} on {self.table.device}; use "auto"'
-                )
-            if _numba_kernels() is None:
-                raise ValueError('backend "numba" needs the package numba, which cannot be imported; use "auto"')
-        kernels = _numba_kernels() if fits_numba and self.backend != "torch" else None
-        backend = hash_grid if kernels is None else kernels.hash_grid
-        return backend(x, self.table, self.scalings)
+        return fitting(self.backend, x, self.table)(x, self.table, self.scalings)

@@ -18,6 +18,9 @@ from torch.autograd.function import once_differentiable
 
 from enerf_ns.compiled import compiled
 
+DEVICE = "cpu"
+"""Type of the device whose tensors the kernels take."""
+
 
 @compiled
 def _cell(x, i, scaling):
