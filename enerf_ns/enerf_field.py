@@ -81,6 +81,7 @@ class HashDensity(nn.Module):
             2022).
         num_features: Outputs beside the density.
         init_density: Density before training, in 1 / scene unit; small, so that training starts without fog.
+        backend: What computes the hash grid, as of `fitting` in `enerf_ns.encodings.hash_grid`.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class HashDensity(nn.Module):
         contraction: bool = False,
         num_features: int = 0,
         init_density: float = 0.01,
+        backend: str = "auto",
     ):
         super().__init__()
         self.register_buffer("aabb", aabb.clone().float())
@@ -106,7 +108,8 @@ class HashDensity(nn.Module):
 
             self.contraction = SceneContraction(order=math.inf)
         # contracted space is twice as wide as what lies within [-1, 1], which keeps its cells
-        self.grid = HashGrid(num_levels, min_res, 2 * max_res if contraction else max_res, log2_table_size)
+        finest = 2 * max_res if contraction else max_res
+        self.grid = HashGrid(num_levels, min_res, finest, log2_table_size, backend=backend)
         self.network = MLP(
             in_dim=self.grid.out_dim,
             num_layers=2,

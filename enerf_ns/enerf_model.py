@@ -47,6 +47,9 @@ class EnerfModelConfig(ModelConfig):
     """Cells along the box at the finest level of the hash grid. None: as fine as the sensor's pixels on the scene."""
     log2_table_size: int = 17
     """Base-2 logarithm of the entries of each level of the hash grid."""
+    hash_grid: str = "auto"
+    """What computes the hash grid: triton (a GPU), numba (a CPU), torch (any device, slow), or the fastest that fits
+    (auto). Results are the same but for rounding, and so are checkpoints."""
     hidden_dim: int = 32
     """Width of the density network."""
     hidden_dim_colour: Annotated[int, tyro.conf.arg(aliases=["--pipeline.model.hidden-dim-color"])] = 32
@@ -158,6 +161,7 @@ class EnerfModel(Model):
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
             contraction=config.contraction,
+            backend=config.hash_grid,
         )
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
         self.proposal = None
@@ -172,6 +176,7 @@ class EnerfModel(Model):
                 log2_table_size=15,
                 hidden_dim=16,
                 contraction=config.contraction,
+                backend=config.hash_grid,
             )
             self.sampler = ProposalNetworkSampler(
                 num_proposal_samples_per_ray=(config.num_proposal_samples,),

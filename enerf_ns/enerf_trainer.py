@@ -36,6 +36,7 @@ from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sent
 from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.encodings.hash_grid import fitting
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
 from enerf_ns.error_against_time import ErrorAgainstTime
 from enerf_ns.guarded_steps import (
@@ -82,6 +83,7 @@ class EnerfTrainerConfig(TrainerConfig):
             OutputError: The run's folder holds another run.
         """
         check_ranges(self)
+        self._check_hash_grid()
         config = deepcopy(self)
         pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
         data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
@@ -104,6 +106,20 @@ class EnerfTrainerConfig(TrainerConfig):
             )
         index_events(config.recording())
         return config
+
+    def _check_hash_grid(self) -> None:
+        """Refuses a backend that is not there or does not run on the device.
+
+        Raises:
+            FlagError: It is the one that is set.
+        """
+        name = self.pipeline.model.hash_grid
+        if name not in ("auto", "torch"):
+            positions = torch.empty(0, 3, device=self.machine.device_type)
+            try:
+                fitting(name, positions, positions[:, :2])
+            except ValueError as error:
+                raise FlagError(f"--pipeline.model.hash-grid: {error}.") from error
 
     def recording(self) -> EventRecording:
         """The recording that is learnt from, of a config that is resolved."""

@@ -13,6 +13,7 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
 
+from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.enerf_config import enerf
 from enerf_ns.sensor.response import Linlog
 from enerf_ns.tables import choices_table, recording_table
@@ -40,6 +41,15 @@ def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, mon
     choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
     assert choices["event loss"]["kept"] and not choices["silent pixels"]["kept"] and not choices["frame loss"]["kept"]
     assert all(choice["why"] and choice["flag"] for choice in choices.values())
+
+
+@pytest.mark.parametrize("name, message", [("cuda", "must be auto, torch, triton or numba"), ("numba", "on meta")])
+def test_a_hash_grid_that_does_not_fit_the_device_is_refused(recording: Path, tmp_path: Path, name: str, message: str):
+    config = small_config(recording, tmp_path)
+    config.pipeline.model.hash_grid = name
+    config.machine.device_type = "meta"  # type: ignore[assignment] - a device that is everywhere, and not the CPU
+    with pytest.raises(FlagError, match=f"--pipeline.model.hash-grid.*{message}"):
+        config.resolved()
 
 
 def test_the_learning_rate_falls_to_a_tenth_at_the_last_step_however_long_the_run(recording: Path, tmp_path: Path):

@@ -76,18 +76,16 @@ class Backend:
     features: tuple[int, ...]
     """Features per level that it knows."""
 
-    def misfit(self, x: Tensor, table: Tensor) -> str | None:
-        """What it needs that these positions and this table are not; None where it can take them."""
+    def misfit(self, device: str, dtype: torch.dtype = torch.float32, num_features: int = 2) -> str | None:
+        """What it needs that positions and a table of this device, type and features per level are not; None where it
+        can take them."""
         module = _module(self.module)
         if module is None:
             return f"the package {self.package}, which cannot be imported"
-        if table.shape[1] not in self.features:
-            return f"{', '.join(map(str, self.features))} features per level, not {table.shape[1]}"
-        if not x.device.type == table.device.type == module.DEVICE or not x.dtype == table.dtype == torch.float32:
-            return (
-                f"positions and table in float32 on the device {module.DEVICE}, not {x.dtype} on {x.device} and "
-                f"{table.dtype} on {table.device}"
-            )
+        if num_features not in self.features:
+            return f"{', '.join(map(str, self.features))} features per level, not {num_features}"
+        if device != module.DEVICE or dtype != torch.float32:
+            return f"positions and table in float32 on the device {module.DEVICE}, not {dtype} on {device}"
         return None
 
 
@@ -107,19 +105,18 @@ def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Te
         table: rows, shape (levels * T, features).
 
     Raises:
-        ValueError: The backend that is named does not fit.
+        ValueError: There is no backend of this name, or it does not fit.
     """
-    asked = [
-        found
-        for found, backend in BACKENDS.items()
-        if name == found or (name == "auto" and x.device.type == backend.device)
-    ]
-    for found in asked:
-        misfit = BACKENDS[found].misfit(x, table)
-        if misfit is None:
-            return importlib.import_module(BACKENDS[found].module).hash_grid
-        if name != "auto":
-            raise ValueError(f'backend "{name}" needs {misfit}; use "auto"')
+    if name not in ("auto", "torch", *BACKENDS):
+        raise ValueError(f'backend is "{name}", but must be auto, torch, {" or ".join(BACKENDS)}')
+    for found, backend in BACKENDS.items():
+        if name != found and (name != "auto" or x.device.type != backend.device):
+            continue
+        misfits = {backend.misfit(tensor.device.type, tensor.dtype, table.shape[1]) for tensor in (x, table)} - {None}
+        if not misfits:
+            return importlib.import_module(backend.module).hash_grid
+        if name == found:
+            raise ValueError(f'backend "{name}" needs {misfits.pop()}; use "auto"')
     return hash_grid
 
 
@@ -139,9 +136,6 @@ class HashGrid(nn.Module):
         features_per_level: numbers in one row.
         init_scale: the table starts uniform in [-init_scale, init_scale).
         backend: as of `fitting`; chosen at each call.
-
-    Raises:
-        ValueError: for an unknown backend.
     """
 
     scalings: Tensor
@@ -157,8 +151,6 @@ class HashGrid(nn.Module):
         backend: str = "auto",
     ) -> None:
         super().__init__()
-        if backend not in ("auto", "torch", *BACKENDS):
-            raise ValueError(f'backend is "{backend}", but must be auto, torch, {" or ".join(BACKENDS)}')
         self.backend = backend
         self.out_dim = num_levels * features_per_level
         growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
@@ -171,8 +163,7 @@ class HashGrid(nn.Module):
         """Encodes positions in [0, 1]; slightly outside, the lattice goes on.
 
         Raises:
-            ValueError: if the last axis of `x` is not 3, or if the backend that is asked for does not fit `x` and the
-                table.
+            ValueError: if the last axis of `x` is not 3, or if there is no such backend, or it does not fit.
         """
         if x.shape[-1] != 3:
             raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")
