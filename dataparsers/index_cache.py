@@ -17,6 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 from platformdirs import user_cache_path
 
@@ -87,7 +88,7 @@ def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]
         OSError: The events do not fit into memory, and cannot be stored either.
         ValueError: The events are not those that were surveyed.
     """
-    num_events, in_memory = int(survey.counts.sum()), _physical_memory() // 4 // 12
+    num_events, in_memory = int(survey.counts.sum()), psutil.virtual_memory().total // 4 // 12
     bands = sorted_bands(stream, survey, in_memory)
     if num_events < CACHED_FROM:
         return _index(*next(bands), survey)
@@ -159,11 +160,3 @@ def _checksum(path: Path) -> list[int]:
             file.seek(start)
             checksum = zlib.crc32(file.read(BLOCK), checksum)
     return [size, checksum]
-
-
-def _physical_memory() -> int:
-    """Memory of the machine in bytes; of a system that does not tell, 8 GiB."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 8 * 2**30

@@ -25,6 +25,7 @@ from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 from enerf_ns.events.batch import TrainBatch
+from enerf_ns.memory import in_parts
 from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.event_supervision import EventSupervision
@@ -126,6 +127,8 @@ class EnerfModel(Model):
     """Hash-grid radiance field whose changes of log brightness explain the events of a camera."""
 
     config: EnerfModelConfig
+    samples_at_once: int | None = None
+    """Samples that the field is asked at once; None: all (`enerf_ns.memory`)."""
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -227,7 +230,7 @@ class EnerfModel(Model):
             samples, weights_list, samples_list = self.sampler(ray_bundle, density_fns=[self.proposal.density_fn])
         else:
             samples, weights_list, samples_list = self.sampler(ray_bundle), [], []
-        field_outputs = self.field(samples)
+        field_outputs = in_parts(self.field, samples, self.samples_at_once)
         weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
         accumulation = self.renderer_accumulation(weights=weights)
         rgb = field_outputs[FieldHeadNames.RGB]

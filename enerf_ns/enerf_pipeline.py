@@ -14,7 +14,7 @@ from tyro.conf import Fixed, Suppress
 
 from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
 from enerf_ns.choices import MethodDefaults, Resolution, resolve
-from enerf_ns.dataparsers.errors import exit_with_a_sentence
+from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -23,8 +23,10 @@ from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ffmpeg import make_ffmpeg_available
+from enerf_ns.memory import SMALL_STEP, StepCost, free_bytes, step_cost
 from enerf_ns.stopwatch import Stopwatch
 from enerf_ns.supervision.event_supervision import brightness_change
+from enerf_ns.terminal import say
 
 
 @dataclass
@@ -83,10 +85,42 @@ class EnerfPipeline(VanillaPipeline):
         super().__init__(config, device, **kwargs)
         self.stopwatch = Stopwatch(device)
         """Is told where each part of a step ends."""
+        self.step_cost: StepCost | None = None
+        """What a training step takes; None where nobody needs to know, since it is small."""
+        self._fit_memory(trains=kwargs.get("test_mode", "val") == "val")
 
     @property
     def model(self) -> EnerfModel:
         return super().model  # type: ignore
+
+    def _fit_memory(self, trains: bool) -> None:
+        """Has the field be asked in parts where a training step, or a part of a picture, would not fit the memory.
+
+        Raises:
+            FlagError: A training step does not fit in any way.
+        """
+        config, rays = self.model.config, self.model.config.eval_num_rays_per_chunk
+        if trains:
+            rays = max(rays, self.datamanager.get_train_rays_per_batch())
+        if rays * config.num_samples <= SMALL_STEP:
+            return
+        cost, free = step_cost(self.model, rays, config.num_samples), free_bytes(self.device)
+        at_once = cost.samples_at_once(free)
+        need = (
+            f"{rays} rays with {config.num_samples} samples each keep {cost.bytes / 1e9:.1f} GB, with gradients twice "
+            f"that, and {free / 1e9:.1f} GB are free"
+        )
+        if at_once == 0:
+            raise FlagError(
+                f"{need}; give fewer with --pipeline.datamanager.event-pairs, --pipeline.datamanager.silent-pairs or "
+                "--pipeline.datamanager.train-num-rays-per-batch."
+            )
+        if at_once is not None:
+            say(
+                f"{need}: the field is asked for {at_once} samples at a time, and when it learns twice, a third slower."
+            )
+        self.model.samples_at_once = at_once
+        self.step_cost = cost if trains else None
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch."""

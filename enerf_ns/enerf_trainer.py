@@ -51,10 +51,13 @@ from enerf_ns.guarded_steps import (
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
 from enerf_ns.tables import choices_table, recording_table
-from enerf_ns.terminal import clear_line, say
+from enerf_ns.terminal import clear_line, duration, say
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
+
+LONG = 3600.0
+"""Seconds of training beyond which it is said beforehand how long it takes."""
 
 
 @dataclass
@@ -232,6 +235,7 @@ class EnerfTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         super().setup(test_mode)
         config = self.config
+        self._say_how_long()
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )
@@ -240,6 +244,15 @@ class EnerfTrainer(Trainer):
             CONSOLE.print(*self.viewer_state.viewer_info, sep="\n", soft_wrap=True, highlight=False, style="green")
         elif self.viewer_state is not None:
             CONSOLE.print(f"Legacy viewer at: {self.viewer_state.viewer_url}", soft_wrap=True, style="green")
+
+    def _say_how_long(self) -> None:
+        """Says how long training will take, where that is long."""
+        cost, steps = self.pipeline.step_cost, self.config.max_num_iterations - self._start_step
+        if cost is not None and cost.seconds * steps > LONG:
+            say(
+                f"{steps} steps of {self.pipeline.datamanager.get_train_rays_per_batch()} rays take about "
+                f"{duration(cost.seconds * steps)} on the {self.device}: enerf takes minutes; this is for a GPU."
+            )
 
     def _check_viewer_warnings(self) -> None:
         """Nothing: evaluation runs under every `--vis`."""

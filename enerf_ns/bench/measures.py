@@ -18,6 +18,7 @@ from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import NotScored, mean_scores
 from enerf_ns.evaluation.views import HeldOutView, held_out_views
 from enerf_ns.event_dataset import EventDataset
+from enerf_ns.memory import kept_bytes
 
 REPEATS = 9
 """How often each part of a step is timed; what is told is the median."""
@@ -84,18 +85,10 @@ def _near_depth(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
 
 def _memory(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     """Megabytes that a step keeps for its backward pass, and the parameters with gradients and running means."""
-    kept: dict[int, int] = {}
-
-    def keep(tensor: torch.Tensor) -> torch.Tensor:
-        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        return tensor
-
     run.pipeline.train()
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        losses = run.pipeline.get_train_loss_dict(0)[1]
-    del losses
+    kept = kept_bytes(lambda: run.pipeline.get_train_loss_dict(0)[1], run.pipeline.model)
     parameters = sum(parameter.nbytes for parameter in run.pipeline.model.parameters())
-    return {"megabytes_a_step": (sum(kept.values()) + 4 * parameters) / 1e6}
+    return {"megabytes_a_step": (kept + 4 * parameters) / 1e6}
 
 
 def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:

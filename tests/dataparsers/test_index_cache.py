@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -186,7 +187,8 @@ def test_a_full_disk_costs_the_cache_and_nothing_else(source: Path, cache: Path,
 def test_bands_of_pixels_make_the_same_index(source: Path, cache: Path, bands: int, monkeypatch: pytest.MonkeyPatch):
     whole = index_events(recording(source))
     shutil.rmtree(cache)
-    monkeypatch.setattr(index_cache, "_physical_memory", lambda: 4 * 12 * (NUM_EVENTS // bands + 100))
+    memory = SimpleNamespace(total=4 * 12 * (NUM_EVENTS // bands + 100))
+    monkeypatch.setattr(index_cache.psutil, "virtual_memory", lambda: memory)
     banded = recording(source)
     assert_equal(index_events(banded), whole)
     assert len(banded.passes) >= 1 + bands  # type: ignore[attr-defined]
