@@ -99,6 +99,6 @@ if __name__ == "__main__":
     name = torch.cuda.get_device_name() if flags.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
     print(f"PyTorch {torch.__version__}, {name}, minimum of {REPETITIONS} repetitions")
     results = [encodings(*sizes, flags.device) for sizes in SETTINGS]
-    results += [adam(*sizes, flags.device) for _, *sizes in SETTINGS]
+    results += [adam(levels, log2_table_size, flags.device) for _, levels, log2_table_size in SETTINGS]
     if flags.json:
         flags.json.write_text(json.dumps({"device": name, "torch": torch.__version__, "results": results}, indent=1))

@@ -89,6 +89,7 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
     """
     device = model.scene_box.aabb.device
     devices = [device] if device.type == "cuda" else []
+    field: Any = model.field
     number = max(16, PROBE_SAMPLES // num_samples)
     with torch.random.fork_rng(devices):
         directions = torch.nn.functional.normalize(torch.randn(number, 3, device=device), dim=-1)
@@ -98,15 +99,15 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
         model.train()
 
         def forward_and_backward() -> None:
-            outputs = model.get_outputs(rays)
+            outputs: Any = model.get_outputs(rays)
             loss = outputs["rgb"].sum() + outputs["accumulation"].sum()
             torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
 
         forward_and_backward()  # compiles
         seconds = _seconds(forward_and_backward, device)
-        samples = model.get_outputs(rays)["ray_samples_list"][-1]
+        samples: Any = model.get_outputs(rays)["ray_samples_list"][-1]
         whole = kept_bytes(lambda: model.get_outputs(rays), model)
-        of_field = kept_bytes(lambda: model.field(samples), model)
+        of_field = kept_bytes(lambda: field(samples), model)
         model.train(was_training)
     share = num_rays / number
     return StepCost(whole * share, of_field * share, seconds * share, num_rays * num_samples)
@@ -136,11 +137,13 @@ def in_parts(
         samples: Shape (rays, samples a ray).
         samples_at_once: At least those of one ray are. None: all.
     """
+    assert samples.shape is not None
     rays, samples_a_ray = samples.shape
     rays_at_once = rays if samples_at_once is None else max(1, samples_at_once // samples_a_ray)
     if rays <= rays_at_once:
         return field(samples)
     parts = [samples[first : first + rays_at_once] for first in range(0, rays, rays_at_once)]
+    found: list[Any]
     if torch.is_grad_enabled():
         found = [checkpoint(field, part, use_reentrant=False, preserve_rng_state=False) for part in parts]
     else:

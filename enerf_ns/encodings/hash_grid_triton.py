@@ -6,7 +6,10 @@ from call to call. With TRITON_INTERPRET=1 in the environment before Triton is i
 as NumPy, which is for tests.
 """
 
-# Triton reads annotations such as tl.constexpr where they stand: no postponed ones here.
+# Triton reads annotations such as tl.constexpr where they stand: no postponed ones here. Kernels are called with
+# tensors where they take pointers, and with numbers where they take tl.constexpr:
+# pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+
 import torch
 import triton
 import triton.language as tl
