@@ -174,9 +174,11 @@ def test_a_folder_that_cannot_be_written_costs_the_cache_and_nothing_else(source
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_costs_the_cache_and_nothing_else(source: Path, cache: Path, monkeypatch: pytest.MonkeyPatch):
     opened = open
-    monkeypatch.setattr(
-        "builtins.open", lambda path, *mode: opened("/dev/full" if str(path).endswith("/times") else path, *mode)
-    )
+
+    def open_on_a_full_disk(path, *mode, **options):
+        return opened("/dev/full" if str(path).endswith("/times") else path, *mode, **options)
+
+    monkeypatch.setattr("builtins.open", open_on_a_full_disk)
     made = recording(source)
     assert len(index_events(made)) == NUM_EVENTS
     assert "No space left on device" in index_events(made).notes[0]

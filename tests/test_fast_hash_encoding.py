@@ -11,9 +11,9 @@ from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import nn
 
-from enerf_ns.encodings.for_nerfstudio import FastHashEncoding, speed_up_hash_grids
+from enerf_ns.fast_hash_encoding import FastHashEncoding, speed_up_hash_grids
 
-PAGE = Path(__file__).parents[2] / "docs" / "hash-grid.md"
+PAGE = Path(__file__).parents[1] / "docs" / "hash-grid.md"
 
 
 def test_a_field_of_nerfacto_keeps_values_gradients_and_checkpoint():
