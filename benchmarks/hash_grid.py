@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from enerf_ns.encodings.hash_grid import BACKENDS, HashGrid
+from enerf_ns.stopwatch import seconds_of
 
 REPETITIONS = 10
 THEIRS = "Nerfstudio, PyTorch"
@@ -36,13 +36,7 @@ def minimum_times(functions: dict[str, Callable[[], object]], device: torch.devi
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(REPETITIONS + 1):
         for name, function in functions.items():
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            start = time.perf_counter()
-            function()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            times[name].append(1e3 * (time.perf_counter() - start))
+            times[name].append(1e3 * seconds_of(function, device))
     return {name: min(values[1:]) for name, values in times.items()}
 
 

@@ -23,7 +23,7 @@ from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ffmpeg import make_ffmpeg_available
-from enerf_ns.memory import SMALL_STEP, StepCost, free_bytes, step_cost
+from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.stopwatch import Stopwatch
 from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.terminal import say
@@ -85,8 +85,8 @@ class EnerfPipeline(VanillaPipeline):
         super().__init__(config, device, **kwargs)
         self.stopwatch = Stopwatch(device)
         """Is told where each part of a step ends."""
-        self.step_cost: StepCost | None = None
-        """What a training step takes; None where nobody needs to know, since it is small."""
+        self.seconds_a_step: float | None = None
+        """What a training step will take; None where nobody needs to know, since it is small."""
         self._fit_memory(trains=kwargs.get("test_mode", "val") == "val")
 
     @property
@@ -99,9 +99,9 @@ class EnerfPipeline(VanillaPipeline):
         Raises:
             FlagError: A training step does not fit in any way.
         """
-        config, rays = self.model.config, self.model.config.eval_num_rays_per_chunk
-        if trains:
-            rays = max(rays, self.datamanager.get_train_rays_per_batch())
+        config = self.model.config
+        trained = self.datamanager.get_train_rays_per_batch() if trains else 0
+        rays = max(trained, config.eval_num_rays_per_chunk)
         if rays * config.num_samples <= SMALL_STEP:
             return
         cost, free = step_cost(self.model, rays, config.num_samples), free_bytes(self.device)
@@ -110,17 +110,19 @@ class EnerfPipeline(VanillaPipeline):
             f"{rays} rays with {config.num_samples} samples each keep {cost.bytes / 1e9:.1f} GB, with gradients twice "
             f"that, and {free / 1e9:.1f} GB are free"
         )
-        if at_once == 0:
+        if at_once == 0 and trains:
             raise FlagError(
-                f"{need}; give fewer with --pipeline.datamanager.event-pairs, --pipeline.datamanager.silent-pairs or "
-                "--pipeline.datamanager.train-num-rays-per-batch."
+                f"{need}; give fewer with --pipeline.datamanager.event-pairs, --pipeline.datamanager.silent-pairs, "
+                "--pipeline.datamanager.train-num-rays-per-batch or --pipeline.model.eval-num-rays-per-chunk."
             )
         if at_once is not None:
+            at_once = max(at_once, config.num_samples)
             say(
                 f"{need}: the field is asked for {at_once} samples at a time, and when it learns twice, a third slower."
             )
         self.model.samples_at_once = at_once
-        self.step_cost = cost if trains else None
+        again = 1.0 if at_once is None else 4.0 / 3.0  # parts are rendered once more for the backward pass
+        self.seconds_a_step = again * cost.seconds * trained / rays if trains else None
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch."""

@@ -247,11 +247,12 @@ class EnerfTrainer(Trainer):
 
     def _say_how_long(self) -> None:
         """Says how long training will take, where that is long."""
-        cost, steps = self.pipeline.step_cost, self.config.max_num_iterations - self._start_step
-        if cost is not None and cost.seconds * steps > LONG:
+        steps = self.config.max_num_iterations - self._start_step
+        seconds = steps * (self.pipeline.seconds_a_step or 0.0)
+        if seconds > LONG:
             say(
                 f"{steps} steps of {self.pipeline.datamanager.get_train_rays_per_batch()} rays take about "
-                f"{duration(cost.seconds * steps)} on the {self.device}: enerf takes minutes; this is for a GPU."
+                f"{duration(seconds)} on the {self.device}: enerf takes minutes; this is for a GPU."
             )
 
     def _check_viewer_warnings(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +12,8 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.models.base_model import Model
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
+
+from enerf_ns.stopwatch import seconds_of
 
 SHARE = 0.8
 """Of the free memory that a step may fill."""
@@ -90,6 +91,7 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
     device = model.scene_box.aabb.device
     devices = [device] if device.type == "cuda" else []
     field: Any = model.field
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     number = max(16, PROBE_SAMPLES // num_samples)
     with torch.random.fork_rng(devices):
         directions = torch.nn.functional.normalize(torch.randn(number, 3, device=device), dim=-1)
@@ -101,27 +103,16 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
         def forward_and_backward() -> None:
             outputs: Any = model.get_outputs(rays)
             loss = outputs["rgb"].sum() + outputs["accumulation"].sum()
-            torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
+            torch.autograd.grad(loss, parameters, allow_unused=True)
 
         forward_and_backward()  # compiles
-        seconds = _seconds(forward_and_backward, device)
+        seconds = seconds_of(forward_and_backward, device)
         samples: Any = model.get_outputs(rays)["ray_samples_list"][-1]
         whole = kept_bytes(lambda: model.get_outputs(rays), model)
         of_field = kept_bytes(lambda: field(samples), model)
         model.train(was_training)
     share = num_rays / number
     return StepCost(whole * share, of_field * share, seconds * share, num_rays * num_samples)
-
-
-def _seconds(call: Callable[[], Any], device: torch.device) -> float:
-    """Wall time of a call."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    start = time.perf_counter()
-    call()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter() - start
 
 
 def in_parts(

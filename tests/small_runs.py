@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.utils import writer
 
 from enerf_ns.enerf_config import enerf
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
@@ -43,6 +44,7 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
 def set_up(config: EnerfTrainerConfig) -> Any:
     """A trainer as `ns-train` makes it, set up."""
     _set_random_seed(config.machine.seed)
+    writer.EVENT_WRITERS.clear()  # of the run before, whose folder may be gone
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

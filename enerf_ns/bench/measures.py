@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -19,6 +18,7 @@ from enerf_ns.evaluation.scores import NotScored, mean_scores
 from enerf_ns.evaluation.views import HeldOutView, held_out_views
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.memory import kept_bytes
+from enerf_ns.stopwatch import seconds_of
 
 REPEATS = 9
 """How often each part of a step is timed; what is told is the median."""
@@ -121,14 +121,8 @@ def milliseconds_a_step(run: Run) -> float:
 
 def _milliseconds(call: Callable[[], object], run: Run) -> float:
     """Median wall time of a call, after one that warms up."""
-    times = []
-    for _ in range(REPEATS + 1):
-        start = time.perf_counter()
-        call()
-        if run.pipeline.device.type == "cuda":
-            torch.cuda.synchronize()
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times[1:])
+    times = [seconds_of(call, run.pipeline.device) for _ in range(REPEATS + 1)]
+    return 1e3 * statistics.median(times[1:])
 
 
 MEASURES: dict[str, Callable[[Run, Sequence[HeldOutView]], dict[str, float]]] = {
