@@ -49,8 +49,8 @@ class MethodDefaults:
     event_loss: str = "huber"
     no_event_loss_weight: float = 0.1
     no_event_margin: float = 0.0
-    paper_batch: bool = False
-    """Whether presets bring their batch sizes, which are for a GPU."""
+    whole_preset: bool = False
+    """Whether presets bring their box and batch sizes, too, which are those of the paper's network."""
     settings: tuple[tuple[str, Any], ...] = ()
     """What the method sets, which presets and recordings leave alone: names within the config of the pipeline, such as
     model.sampling, and values."""
@@ -174,8 +174,8 @@ class _Resolver:
         self.selection: list[str] = []
         self.preset_values: dict[str, Any] = {}
         if preset is not None:
-            name, paper_batch = preset_named(preset), config.defaults.paper_batch
-            self.preset_values, self.selection = selections(name, recording, self.parser, paper_batch)
+            name, whole = preset_named(preset), config.defaults.whole_preset
+            self.preset_values, self.selection = selections(name, recording, self.parser, whole)
             self._note_flags()
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
         parser = self.parser

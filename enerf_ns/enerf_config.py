@@ -121,7 +121,7 @@ PAPER = MethodDefaults(
     event_loss="squared",
     no_event_loss_weight=5.0,  # 1 / C at the paper's C = 0.2: its weight of 1
     no_event_margin=1.0,
-    paper_batch=True,
+    whole_preset=True,
 )
 
 enerf_paper = MethodSpecification(

@@ -311,7 +311,7 @@ def preset_named(name: str) -> str:
 
 
 def selections(
-    name: str, recording: EventRecording, parser: EventDataParserConfig, paper_batch: bool
+    name: str, recording: EventRecording, parser: EventDataParserConfig, whole: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """What a preset says of the settings of a pipeline, and what to show of it.
 
@@ -320,8 +320,8 @@ def selections(
         recording: The sequence of the preset, with all its frames.
         parser: What the user set; of frames that they chose for one use, none is selected for the other, and where
             they hold out every so many, none is selected at all.
-        paper_batch: Whether the batch sizes are the paper's; with them a step of the method enerf takes some twenty
-            times as long.
+        whole: Whether its box and batch sizes are used, too. Most of the paper's boxes are empty, and its batches are
+            for a GPU.
 
     Returns:
         The settings by their names within the config of the pipeline, and sentences: the selection, what was mended.
@@ -349,12 +349,7 @@ def selections(
             "by --train-frame-indices and --held-out-frame-indices of the data parser"
         )
     start, end = event_time_range(frames, with_pose, preset.event_window)
-    values |= {
-        "datamanager.dataparser.box": preset.box,
-        "datamanager.dataparser.depth_range": preset.depth_range,
-        "datamanager.dataparser.time_range": (start, end),
-        "datamanager.silence_ms": preset.silence_ms,
-    }
+    values |= {"datamanager.dataparser.time_range": (start, end), "datamanager.silence_ms": preset.silence_ms}
     if preset.contrast_thresholds is None:
         values["model.event_loss"] = "normalised"
     else:
@@ -364,21 +359,25 @@ def selections(
         # The losses count changes in thresholds: squared ones for events, plain ones for silent pixels.
         weight = preset.no_event_weight / (0.5 * sum(preset.contrast_thresholds))
         values |= {"model.no_event_loss_weight": weight, "model.no_event_margin": 1.0}
-    if paper_batch:
+    if whole:
         values |= {
+            "datamanager.dataparser.box": preset.box,
+            "datamanager.dataparser.depth_range": preset.depth_range,
             "datamanager.event_pairs": preset.event_pairs,
             "datamanager.silent_pairs": preset.silent_pairs,
             "datamanager.train_num_rays_per_batch": preset.frame_rays,
         }
 
     x, y, z, half = preset.box
+    box = f"a cube of {2.0 * half:.3g} m around ({x:.3g}, {y:.3g}, {z:.3g}) m"
     lines = [
         f"Preset {name}: {len(preset.train_frames)} train and {len(preset.held_out_frames)} held-out frames, "
-        f"events from {start:.3f} s to {end:.3f} s, a cube of {2.0 * half:.3g} m around ({x:.3g}, {y:.3g}, {z:.3g}) m."
+        f"events from {start:.3f} s to {end:.3f} s{whole * f', {box}'}."
     ]
-    if not paper_batch:
+    if not whole:
         lines.append(
-            "The batch, silent pixels included, is the one that the method is tuned for; the preset's "
-            f"{preset.event_pairs} event pairs a step are for a GPU and the method enerf-paper."
+            f"The box is measured in place of the preset's, {box}, and the batch, silent pixels included, is the one "
+            f"that the method is tuned for; the preset's {preset.event_pairs} event pairs a step are for a GPU and the "
+            "method enerf-paper."
         )
     return values, [*lines, *preset.mended, *preset.notes]

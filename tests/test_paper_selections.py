@@ -292,11 +292,11 @@ def test_the_two_event_losses_stand_to_each_other_as_in_the_paper(name: str, pap
     torch.testing.assert_close(of_silence / of_events, paper)
 
 
-def test_the_batch_of_the_paper_is_left_to_its_own_method(recording: Any):
+def test_the_batch_and_the_box_of_the_paper_are_left_to_its_own_method(recording: Any):
     default, _ = used(pipeline_config(TUNED), recording, None)
     filled, lines = used(pipeline_config(TUNED), recording, "eds11")
-    for name in ("event_pairs", "silent_pairs", "train_num_rays_per_batch"):
-        assert filled[name] == default[name]
+    for name in ("event_pairs", "silent_pairs", "train_num_rays_per_batch", "box", "depth_range"):
+        assert filled[name] == default[name] != used(pipeline_config(), recording, "eds11")[0][name]
     assert filled["train_frame_indices"] == PRESETS["eds11"].train_frames
     assert filled["contrast_thresholds"] == (0.2, 0.2)
     assert any("30096" in line for line in lines)
