@@ -18,7 +18,7 @@ class EventBatch:
     start: Int64[Tensor, " pairs"]
     """First instant of each pair, ns; of a pair of events, that of its first event."""
     end: Int64[Tensor, " pairs"]
-    """Second instant of each pair, ns; later than the first."""
+    """Second instant of each pair, ns; later than the first, or that one again, where there was no pair to draw."""
     on: Int64[Tensor, " pairs"]
     """Number of positive events of each pair, after the first instant and up to and with the second."""
     off: Int64[Tensor, " pairs"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -10,6 +12,9 @@ from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.events.batch import EventBatch
+
+MOST_DRAWS = 64
+"""Pairs that are drawn for one that is kept, at most."""
 
 CHUNK = 2**20
 """Events looked at together while the pairs are counted, so that this needs little memory beside the index."""
@@ -168,6 +173,9 @@ class SilentPixelSampler:
     or of the stretch, and begins when the pixel can see again. From an interval at least `min_duration_ns` long, two
     instants are drawn uniformly, at most `max_duration_ns` apart, never at an event and never within `held_out`.
 
+    How many are drawn for one that is kept is found out once, at the first batch: what is drawn has the same shape at
+    every step, so that on a GPU no step waits for numbers.
+
     Args:
         index: The events; batches come out on its device.
         start_ns, end_ns: First and last instant that may be drawn.
@@ -179,8 +187,6 @@ class SilentPixelSampler:
     Raises:
         ValueError: A duration is shorter than its minimum, or no stretch lies between start and end.
     """
-
-    ROUNDS = 32
 
     def __init__(
         self,
@@ -201,36 +207,33 @@ class SilentPixelSampler:
         self.min_duration_ns, self.max_duration_ns = min_duration_ns, max_duration_ns
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
         self._held_out = held_out
+        self._draws = _Draws()
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
 
-        Where silent intervals are so rare that `ROUNDS` rounds find fewer, those found are used again, with other
-        instants; where they find none, the batch is empty. It has fewer pairs where most of time is held out.
+        Where silent intervals are so rare that `MOST_DRAWS` a pair hold fewer, those found are used again; where they
+        hold none, two instants of a pair are one.
 
         Args:
             batch_size: Pairs.
             generator: On the device of the index.
             refractory_ns: For how long a pixel is blind after an event.
         """
-        found = []
-        for _ in range(self.ROUNDS):
-            found.append(self._silent_intervals(max(2 * batch_size, 1024), generator, max(refractory_ns, 1)))
-            if sum(len(pixels) for pixels, _, _ in found) >= batch_size:
-                break
-        pixels, begin, end = (torch.cat(parts) for parts in zip(*found, strict=True))
-        if len(pixels):
-            drawn = batch_size if self._held_out is None else 2 * batch_size
-            again = torch.arange(drawn, device=pixels.device) % len(pixels)
-            pixels, begin, end = pixels[again], begin[again], end[again]
-        batch = _silent_pairs(pixels, begin, end, generator)
-        if self._held_out is None:
-            return batch
-        learnt = (_part(torch.stack([batch.start, batch.end]), self._held_out) % 2 == 0).all(dim=0)
-        return batch.subset(learnt & (learnt.cumsum(0) <= batch_size))
 
-    def _silent_intervals(self, draws: int, generator: torch.Generator, blind_ns: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels, first and last silent instant around an instant drawn at random; the long enough of `draws`."""
+        def pairs(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
+            pixels, begin, end, usable = self._silent_intervals(draws, generator, max(refractory_ns, 1))
+            batch = _silent_pairs(pixels, begin, end, generator)
+            if self._held_out is not None:
+                usable &= (_part(torch.stack([batch.start, batch.end]), self._held_out) % 2 == 0).all(dim=0)
+            return batch, usable
+
+        return self._draws.pairs(pairs, batch_size, generator)
+
+    def _silent_intervals(
+        self, draws: int, generator: torch.Generator, blind_ns: int
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pixels, first and last silent instant around an instant drawn at random, and which are long enough."""
         times, offsets = self.index.times, self.index.offsets
         pixels, instant, start_ns, end_ns = self._moments.draw(draws, generator)
         first, stop = offsets[pixels], offsets[pixels + 1]
@@ -242,7 +245,7 @@ class SilentPixelSampler:
         usable = (instant >= begin) & (end - begin >= self.min_duration_ns)
         begin = torch.maximum(begin, instant - self.max_duration_ns // 2)
         end = torch.minimum(end, instant + self.max_duration_ns // 2)
-        return pixels[usable], begin[usable], end[usable]
+        return pixels, begin, end, usable
 
 
 class SilentIntervalSampler:
@@ -263,21 +266,26 @@ class SilentIntervalSampler:
     def __init__(self, index: EventIndex, stretches: Int64[Tensor, "stretches 2"] | None = None):
         self._intervals = EventPairSampler(index, "successor", stretches=stretches)
         self._stretches = stretches
+        self._draws = _Draws()
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
-        """Draws `batch_size` silent pairs (on = off = 0), less those of intervals that hold no two instants.
+        """Draws `batch_size` silent pairs (on = off = 0); where there are few or none, as of `SilentPixelSampler`.
 
         Args:
             batch_size: Pairs.
             generator: On the device of the index.
             refractory_ns: For how long a pixel is blind after an event.
         """
-        intervals = self._intervals.sample(batch_size, generator)
-        begin, end = intervals.start + max(refractory_ns, 1), intervals.end - 1
-        usable = begin < end
-        if self._stretches is not None:
-            usable &= _part(intervals.start, self._stretches) == _part(intervals.end, self._stretches)
-        return _silent_pairs(intervals.pixels[usable], begin[usable], end[usable], generator)
+
+        def pairs(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
+            intervals = self._intervals.sample(draws, generator)
+            begin, end = intervals.start + max(refractory_ns, 1), intervals.end - 1
+            usable = begin < end
+            if self._stretches is not None:
+                usable &= _part(intervals.start, self._stretches) == _part(intervals.end, self._stretches)
+            return _silent_pairs(intervals.pixels, begin, end, generator), usable
+
+        return self._draws.pairs(pairs, batch_size, generator)
 
 
 class AccumulationSampler:
@@ -302,7 +310,6 @@ class AccumulationSampler:
     """
 
     NEGATIVE_SHARE = 0.1
-    ROUNDS = 32
 
     def __init__(
         self,
@@ -320,38 +327,44 @@ class AccumulationSampler:
         self.index = index
         self.max_duration_ns = max_duration_ns
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
+        self._of_fired, self._of_any = _Draws(), _Draws()
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
         """Draws `batch_size` pairs.
 
-        Where events are so rare that `ROUNDS` rounds find fewer pairs with events, those found are used again; where
-        they find none, there are negatives alone.
+        Where events are so rare that `MOST_DRAWS` a pair hold fewer, those found are used again; where they hold none,
+        two instants of a pair are one, and it counts no events.
 
         Args:
             batch_size: Pairs.
             generator: On the device of the index.
         """
-        negatives, draws = round(self.NEGATIVE_SHARE * batch_size), max(2 * batch_size, 1024)
-        negative, windows = self._windows(draws, generator).tensor_split([negatives], dim=1)
-        found = [_with_events(windows)]
-        while sum(part.shape[1] for part in found) < batch_size - negatives and len(found) < self.ROUNDS:
-            found.append(_with_events(self._windows(draws, generator)))
-        fired = torch.cat(found, dim=1)
-        if fired.shape[1]:
-            fired = fired[:, torch.arange(batch_size - negatives, device=fired.device) % fired.shape[1]]
-        pixels, start, end, on, off = torch.cat([fired, negative], dim=1)
-        return EventBatch(pixels, start, end, on, off, starts_at_events=False)
+        negatives = round(self.NEGATIVE_SHARE * batch_size)
 
-    def _windows(self, draws: int, generator: torch.Generator) -> Int64[Tensor, "5 windows"]:
-        """Pixels, starts, ends, on and off events of windows of any length but 0 at any pixel; at most `draws`."""
+        def windows(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
+            windows = self._windows(draws, generator)
+            return windows, windows.start < windows.end
+
+        def fired(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
+            windows = self._windows(draws, generator)
+            return windows, windows.on + windows.off > 0
+
+        found = (
+            self._of_fired.pairs(fired, batch_size - negatives, generator),
+            self._of_any.pairs(windows, negatives, generator),
+        )
+        columns = (torch.cat(both) for both in zip(*(batch.columns for batch in found), strict=True))
+        return EventBatch(*columns, starts_at_events=False)
+
+    def _windows(self, draws: int, generator: torch.Generator) -> EventBatch:
+        """Windows of any length, also 0, at any pixel."""
         pixels, end, first, _ = self._moments.draw(draws, generator)
         duration = torch.randint(self.max_duration_ns, (draws,), generator=generator, device=end.device) + 1
         start = (end - duration).clamp(min=first)
         until_start, until_end = (self.index.count_until(pixels, time) for time in (start, end))
         before = self.index.offsets[pixels]
         on = self._positives(before + until_end) - self._positives(before + until_start)
-        off = until_end - until_start - on
-        return torch.stack([pixels, start, end, on, off])[:, start < end]
+        return EventBatch(pixels, start, end, on, until_end - until_start - on, starts_at_events=False)
 
     def _positives(self, events: Int64[Tensor, " windows"]) -> Int64[Tensor, " windows"]:
         """Number of positive events among so many first ones of the index."""
@@ -389,14 +402,47 @@ class _PixelMoments:
         return pixels, ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
 
 
-def _with_events(windows: Int64[Tensor, "5 windows"]) -> Int64[Tensor, "5 fired"]:
-    """Those windows in which their pixels fired."""
-    return windows[:, windows[3] + windows[4] > 0]
+class _Draws:
+    """How many pairs are drawn at random for those that are kept."""
+
+    def __init__(self) -> None:
+        self._kept: float | None = None
+        """Share of what is drawn that is kept, at least."""
+
+    def pairs(
+        self,
+        draw: Callable[[int, torch.Generator], tuple[EventBatch, Tensor]],
+        number: int,
+        generator: torch.Generator,
+    ) -> EventBatch:
+        """The first pairs of those drawn that are kept; where there are fewer, those again, and where there are none,
+        pairs of one instant and no events.
+
+        Args:
+            draw: Draws so many pairs by a generator, and says which are kept.
+            number: Pairs.
+            generator: That draws them.
+        """
+        if self._kept is None:
+            _, kept = draw(max(MOST_DRAWS * number, 1024), torch.Generator(generator.device).manual_seed(0))
+            sure = kept.double().mean() - 4.0 * (kept.double().var() / len(kept)).sqrt()
+            self._kept = max(float(sure), 1.0 / MOST_DRAWS)
+        spread = 4.0 * math.sqrt(number) + 16.0
+        batch, kept = draw(math.ceil(min((number + spread) / self._kept, MOST_DRAWS * (number + 16))), generator)
+        places = kept.logical_not().to(torch.uint8).argsort(stable=True)  # those that are kept come first, in order
+        num_kept = kept.count_nonzero()
+        places = places[torch.arange(number, device=kept.device) % num_kept.clamp(min=1)]
+        pixels, start, end, on, off = (column[places] for column in batch.columns)
+        none = num_kept == 0
+        end, on, off = torch.where(none, start, end), on.masked_fill(none, 0), off.masked_fill(none, 0)
+        silent = number if batch.num_silent else 0
+        return EventBatch(pixels, start, end, on, off, num_silent=silent, starts_at_events=batch.starts_at_events)
 
 
 def _silent_pairs(pixels: Tensor, begin: Tensor, end: Tensor, generator: torch.Generator) -> EventBatch:
-    """Pairs of two different instants of each silent interval, given by its first and last instant."""
-    instants = end - begin + 1
+    """Pairs of two different instants of each silent interval, given by its first and last instant; of intervals that
+    hold no two, any."""
+    instants = (end - begin + 1).clamp(min=2)
     one = _randint(instants, generator)
     other = _randint(instants - 1, generator)
     other += other >= one

@@ -494,10 +494,14 @@ def test_rare_silence_still_fills_the_batch() -> None:
     assert_counts_are_right(pairs, pixels)
 
 
-def test_no_silence_gives_an_empty_batch() -> None:
+def test_where_there_is_no_silence_pairs_are_of_one_instant() -> None:
+    """Between which nothing changes, so that they cost nothing."""
     pixels = {pixel: [(t, 1) for t in range(0, 100, 5)] for pixel in range(WIDTH * HEIGHT)}
-    pairs = SilentPixelSampler(index_of(pixels), 0, 99, 4, 1000).sample(64, torch.Generator().manual_seed(0))
-    assert len(pairs) == 0 and pairs.on.shape == pairs.end.shape == (0,)
+    never = SilentPixelSampler(index_of(pixels), 0, 99, 4, 1000), SilentIntervalSampler(index_of({3: [(5, 1), (7, 1)]}))
+    for sampler in never:
+        pairs = sampler.sample(64, torch.Generator().manual_seed(0))
+        assert pairs.num_silent == len(pairs) == 64 and torch.equal(pairs.start, pairs.end)
+        assert not (pairs.on + pairs.off).any()
 
 
 @pytest.mark.parametrize("arguments", [{"max_distance": 0}, {"window_ns": 0}])
@@ -587,7 +591,8 @@ def test_rare_events_still_fill_a_batch_of_windows_and_none_leave_negatives() ->
     assert len(pairs) == 1000 and set(pairs.pixels[:900].tolist()) == {3}
     assert_counts_are_right(pairs, pixels)
     pairs = AccumulationSampler(index_of(pixels), 0, 10**12, 40).sample(1000, torch.Generator().manual_seed(0))
-    assert len(pairs) == 100 and not (pairs.on + pairs.off).any()
+    assert len(pairs) == 1000 and not (pairs.on + pairs.off).any()
+    assert torch.equal(pairs.start[:900], pairs.end[:900]) and (pairs.start[900:] < pairs.end[900:]).all()
 
 
 def test_windows_that_cannot_be_drawn_are_refused() -> None:
@@ -614,7 +619,7 @@ def test_silent_intervals_lie_between_successive_events(equal_stamps, refractory
     stretches = torch.tensor(STRETCHES, device=device) if gaps else None
     sampler = SilentIntervalSampler(index_of(pixels, device), stretches)
     pairs = sampler.sample(20_000, torch.Generator(device).manual_seed(0), refractory)
-    assert pairs.num_silent == len(pairs) > 10_000 and not pairs.on.any() and not pairs.off.any()
+    assert pairs.num_silent == len(pairs) == 20_000 and not pairs.on.any() and not pairs.off.any()
     assert_counts_are_right(pairs, pixels)
     shares = []
     for pixel, a, b in rows(pairs):
