@@ -127,13 +127,13 @@ class Trajectory:
                 none.
 
         Raises:
-            ValueError: A time outside [start, end].
+            ValueError: A time outside [start, end]. On a GPU, where looking would wait for it, its pose is NaN.
         """
         fraction = None
         if delays is not None:
             whole = delays.detach().round()
             times, fraction = times + whole.long(), (delays - whole).flatten()
-        if times.numel() and not self.covers(times).all():
+        if times.numel() and times.device.type == "cpu" and not self.covers(times).all():
             raise ValueError(
                 f"Poses were asked for times from {times.min().item() * 1e-9:.6f} s to {times.max().item() * 1e-9:.6f} "
                 f"s, but the trajectory covers only {self.start * 1e-9:.6f} s to {self.end * 1e-9:.6f} s."
@@ -142,6 +142,8 @@ class Trajectory:
         flat = times.flatten().contiguous()
         segment = torch.searchsorted(knots, flat, right=True).sub_(1).clamp_(max=len(angles) - 1)
         passed = (flat - knots[segment]).double()
+        if flat.device.type != "cpu":
+            passed = passed.where(self.covers(flat), torch.nan)
         if fraction is not None:
             passed = passed + fraction
         duration = (knots[1:] - knots[:-1])[segment]

@@ -207,6 +207,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         pictures = [self.train_dataset.get_numpy_image(i) for i in range(len(self.train_dataset))]
         return torch.from_numpy(np.stack(pictures)).to(self.device)
 
+    @cached_property
+    def _frames_are_grey(self) -> bool:
+        return bool((self.frame_colours == self.frame_colours[..., :1]).all())
+
     def next_batch(self, sensor: SensorModel) -> TrainBatch:
         """Draws what one training step looks at.
 
@@ -225,7 +229,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         if "frames" in config.supervision:
             indices = self._frame_pixels(self._num_frame_pixels)
             instants = self._frame_instants(indices[:, 0])
-            frames = FrameBatch(indices, instants, self.frame_colours[tuple(indices.T)].float() / 255.0)
+            colours = self.frame_colours[tuple(indices.T)].float() / 255.0
+            frames = FrameBatch(indices, instants, colours, self._frames_are_grey)
         return TrainBatch(events, frames)
 
     def rays(self, batch: TrainBatch, sensor: SensorModel) -> PairedRayBundle:

@@ -24,7 +24,7 @@ from torch.nn import Parameter
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
-from enerf_ns.events.batch import TrainBatch
+from enerf_ns.events.batch import FrameBatch, TrainBatch
 from enerf_ns.memory import in_parts
 from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
@@ -271,7 +271,7 @@ class EnerfModel(Model):
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
         if batch.frames is not None:
-            losses["frame_loss"] = config.frame_loss_weight * frame_loss(frames, batch.frames.colours, self.is_grey)
+            losses["frame_loss"] = config.frame_loss_weight * self._frame_loss(frames, batch.frames)
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             if config.opacity_loss_weight:
@@ -290,8 +290,11 @@ class EnerfModel(Model):
         if batch.events is not None:
             metrics |= self.supervision.metrics(start, end, batch.events, self.sensor)
         if batch.frames is not None:
-            metrics["frame_psnr"] = -10.0 * torch.log10(frame_loss(frames, batch.frames.colours, self.is_grey))
+            metrics["frame_psnr"] = -10.0 * torch.log10(self._frame_loss(frames, batch.frames))
         return metrics
+
+    def _frame_loss(self, rendered: Tensor, frames: FrameBatch) -> Tensor:
+        return frame_loss(rendered, frames.colours, grey=self.is_grey or frames.are_grey)
 
     @property
     def is_grey(self) -> bool:

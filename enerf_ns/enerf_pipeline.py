@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
+from nerfstudio.models.base_model import Model
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.distributed import barrier
+from torch.nn.parallel import DistributedDataParallel
 from tyro.conf import Fixed, Suppress
 
 from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
@@ -81,13 +84,21 @@ class EnerfPipeline(VanillaPipeline):
     last_step: TrainStep
     """The last training step, once there was one."""
 
-    def __init__(self, config: EnerfPipelineConfig, device: str, **kwargs: Any):
+    def __init__(
+        self, config: EnerfPipelineConfig, device: str, world_size: int = 1, local_rank: int = 0, **kwargs: Any
+    ):
         super().__init__(config, device, **kwargs)
         self.stopwatch = Stopwatch(device)
         """Is told where each part of a step ends."""
         self.seconds_a_step: float | None = None
         """What a training step will take; None where nobody needs to know, since it is small."""
         self._fit_memory(trains=kwargs.get("test_mode", "val") == "val")
+        self.world_size = world_size
+        if world_size > 1:  # here, since Nerfstudio takes every device for a GPU
+            gpus = [local_rank] if torch.device(device).type == "cuda" else None
+            parallel = DistributedDataParallel(self._model, device_ids=gpus, find_unused_parameters=True)
+            self._model = cast("Model", parallel)
+            barrier(device_ids=gpus)
 
     @property
     def model(self) -> EnerfModel:

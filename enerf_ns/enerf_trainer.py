@@ -17,6 +17,7 @@ import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
+from nerfstudio.utils.comms import is_main_process
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
@@ -37,13 +38,14 @@ from enerf_ns.dataparsers.files import write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.encodings.hash_grid import fitting
-from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig
+from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.error_against_time import ErrorAgainstTime
 from enerf_ns.guarded_steps import (
     LEARNING_CHECKED_EVERY,
     LEARNING_CHECKED_FROM,
     MOST_SKIPPED,
     GuardedOptimizers,
+    Later,
     keep_batch,
     what_is_not_finite,
     why_nothing_is_learnt,
@@ -225,6 +227,7 @@ class EnerfTrainer(Trainer):
         self.num_skipped = 0
         """Steps that were left out because they were not finite."""
         self._skipped_in_a_row = 0
+        self._unseen: Later[tuple[int, TrainStep]] | None = None  # the last step
         self._trained = -1  # the last step that was
         self._interrupted = False
         self._recorded: dict[str, Any] | None = None  # of the time before the checkpoint
@@ -235,11 +238,12 @@ class EnerfTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         super().setup(test_mode)
         config = self.config
-        self._say_how_long()
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )
-        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
+        if is_main_process():  # of those that train together, one tells of it
+            self._say_how_long()
+            self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
         if isinstance(self.viewer_state, Viewer):
             CONSOLE.print(*self.viewer_state.viewer_info, sep="\n", soft_wrap=True, highlight=False, style="green")
         elif self.viewer_state is not None:
@@ -322,7 +326,8 @@ class EnerfTrainer(Trainer):
         self._handle_signals()
         config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
         try:
-            self.error_against_time.begin(self._start_step, self._recorded)
+            if is_main_process():
+                self.error_against_time.begin(self._start_step, self._recorded)
             super().train()
         except OSError as error:  # of what Nerfstudio writes beside checkpoints, such as TensorBoard's files
             raise SystemExit(
@@ -339,10 +344,7 @@ class EnerfTrainer(Trainer):
             results = super().train_iteration(step)
         self._metrics = results[2]
         self._trained = step
-        if self.optimizers.skipped:
-            self._look_at_skipped(step)
-        else:
-            self._skipped_in_a_row = 0
+        self._look_at_finite(step)
         if step >= LEARNING_CHECKED_FROM and step % LEARNING_CHECKED_EVERY == 0:
             self._look_at_learning(step)
         if self._interrupted:
@@ -350,9 +352,20 @@ class EnerfTrainer(Trainer):
         return results
 
     def eval_iteration(self, step: int) -> None:
-        if not self.stop_training:
+        if not self.stop_training and is_main_process():
             self.error_against_time.after_step(step, self._metrics)
         super().eval_iteration(step)
+
+    def _look_at_finite(self, step: int) -> None:
+        """Counts steps that were left out; on a GPU the one before this, which it knows by now."""
+        assert self.optimizers.finite is not None
+        latest = Later((step, self.pipeline.last_step), self.optimizers.finite)
+        known = self._unseen if self.optimizers.finite.is_cuda else latest
+        self._unseen = latest
+        if known is not None and not known:
+            self._look_at_skipped(*known.seen)
+        elif known is not None:
+            self._skipped_in_a_row = 0
 
     def _finish(self, step: int) -> None:
         """Scores the run at its end, whose checkpoint is stored by then; an interruption stops that at once."""
@@ -364,29 +377,28 @@ class EnerfTrainer(Trainer):
             if isinstance(log, writer.TensorboardWriter):
                 log.tb_writer.flush()
 
-    def _is_finite(self) -> bool:
+    def _is_finite(self) -> Tensor:
         """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
 
         Where mixed precision scales the loss, gradients that overflow are the scaler's, who leaves them out.
         """
         self.pipeline.stopwatch.lap("backward")
         numbers = list(self.pipeline.last_step.losses.values())
-        if self.grad_scaler.get_scale() <= 1:
+        if not self.grad_scaler.is_enabled() or self.grad_scaler.get_scale() <= 1:
             numbers += [
                 torch.linalg.vector_norm(parameter.grad)
                 for parameter in self.pipeline.parameters()
                 if parameter.grad is not None
             ]
-        return bool(torch.stack([number.float() for number in numbers]).isfinite().all())
+        return torch.stack([number.float() for number in numbers]).isfinite().all()
 
-    def _look_at_skipped(self, step: int) -> None:
+    def _look_at_skipped(self, step: int, seen: TrainStep) -> None:
         """Counts a step that was left out, keeps the batch of the first, and gives up after some in a row."""
-        seen = self.pipeline.last_step
         term = what_is_not_finite(seen, self.pipeline.model)
         self.optimizers.zero_grad_all()  # of which some may be gathered over several steps
         self.num_skipped += 1
         self._skipped_in_a_row += 1
-        if self.num_skipped == 1:
+        if self.num_skipped == 1 and is_main_process():
             file = self.base_dir / f"skipped-step-{step:09d}.pt"
             try:
                 keep_batch(seen, step, file)

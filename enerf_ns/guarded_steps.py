@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Module, Parameter
 
@@ -16,6 +17,8 @@ from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.enerf_pipeline import TrainStep
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.event_supervision import brightness_change
+
+Seen = TypeVar("Seen")
 
 MOST_SKIPPED = 5
 """Steps in a row that may be skipped because they are not finite, before training stops."""
@@ -28,30 +31,60 @@ NOTHING = 1e-3
 
 
 class GuardedOptimizers(Optimizers):
-    """Nerfstudio's optimisers, which leave out a step that is not finite.
+    """Nerfstudio's optimisers, which leave out a step that is not finite, and on a GPU do not wait to hear whether.
 
     Args:
         config: Optimisers and schedulers by the name of the group of parameters.
         param_groups: Parameters by the name of the group.
-        is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed.
+        is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed;
+            a boolean on their device.
     """
 
-    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], bool]):
+    def __init__(
+        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], is_finite: Callable[[], Tensor]
+    ):
         super().__init__(config, param_groups)
         self.is_finite = is_finite
-        self.skipped = False
-        """Whether the last step was left out."""
+        self.finite: Tensor | None = None
+        """Whether the last step was taken; a boolean on the device."""
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        self.skipped = not self.is_finite()
-        if self.skipped and not grad_scaler.is_enabled():
-            return
-        if self.skipped:  # the scaler must see it, to leave the step out itself
-            for group in param_groups:
-                for parameter in self.parameters[group]:
-                    if parameter.grad is not None:
-                        parameter.grad.fill_(torch.nan)
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+        self.finite = self.is_finite()
+        taken = []
+        for group in param_groups:
+            optimizer = self.optimizers[group]
+            gradients = [parameter.grad for parameter in self.parameters[group] if parameter.grad is not None]
+            if grad_scaler.is_enabled():  # which leaves out what is not finite by itself, and must see it
+                for gradient in sorted(gradients, key=Tensor.numel)[:1]:
+                    gradient.masked_fill_(~self.finite, torch.nan)
+            elif optimizer.defaults.get("fused"):
+                optimizer.found_inf = (~self.finite).float()  # type: ignore[attr-defined] - as GradScaler tells it
+                optimizer.grad_scale = None  # type: ignore[attr-defined]
+            elif not self.finite:
+                continue
+            taken.append(group)
+        super().optimizer_scaler_step_some(grad_scaler, taken)
+
+
+class Later(Generic[Seen]):
+    """Something that was seen at a step, and a boolean that its device will know.
+
+    Asked for a step later, it has come meanwhile, and the next step is on its way to the GPU, which does not idle.
+    """
+
+    def __init__(self, seen: Seen, value: Tensor):
+        self.seen = seen
+        self._come = None
+        self._value = value
+        if value.is_cuda:
+            self._value = torch.empty((), dtype=value.dtype, pin_memory=True).copy_(value, non_blocking=True)
+            self._come = torch.cuda.Event()
+            self._come.record()
+
+    def __bool__(self) -> bool:
+        if self._come is not None:
+            self._come.synchronize()
+        return bool(self._value)
 
 
 def what_is_not_finite(step: TrainStep, model: Module) -> str:

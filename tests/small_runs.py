@@ -41,12 +41,12 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
     return config
 
 
-def set_up(config: EnerfTrainerConfig) -> Any:
+def set_up(config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1) -> Any:
     """A trainer as `ns-train` makes it, set up."""
     _set_random_seed(config.machine.seed)
     writer.EVENT_WRITERS.clear()  # of the run before, whose folder may be gone
     config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
+    trainer = config.setup(local_rank=local_rank, world_size=world_size)
     trainer.setup()
     trainer.pipeline.train()
     return trainer

@@ -103,6 +103,7 @@ def test_two_steps_of_the_setting_of_the_paper(recording: Path, tmp_path: Path, 
 def test_two_steps_with_frames_in_colour_and_grey_events(colour_recording: Path, tmp_path: Path, supervision: str):
     losses = {*EVENTS, "frame_loss"} if "events" in supervision else EVENTS - {"event_loss"} | {"frame_loss"}
     trainer = check_two_steps(small_config(colour_recording, tmp_path, data__supervision=supervision), losses)
+    assert not trainer.pipeline.last_step.batch.frames.are_grey
     model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
     assert model.config.num_channels == 3
     batch = manager.next_batch(model.sensor)

@@ -67,6 +67,7 @@ def test_losses_are_those_of_the_parts(pipeline: Any):
     of_events = model.supervision.losses(start, end, batch.events, model.sensor)
     for name, loss in of_events.items():
         torch.testing.assert_close(losses[name], loss, rtol=0, atol=0)
+    assert batch.frames.are_grey
     error = (luma(frames) - luma(batch.frames.colours)) ** 2
     torch.testing.assert_close(losses["frame_loss"], model.config.frame_loss_weight * error.mean())
     torch.testing.assert_close(losses["opacity_loss"], 0.5 * (1 - outputs["accumulation"]).mean())

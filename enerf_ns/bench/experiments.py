@@ -206,7 +206,7 @@ SEQUENCES: dict[str, Sequence] = {
     "mocap-desk2": Sequence(preset="mocap-desk2"),
     "mocap-desk2-6views": Sequence(preset="mocap-desk2-6views"),
 }
-"""Sequences by name. Presets bring the paper's frames, box, depths and thresholds."""
+"""Sequences by name. Presets bring the paper's frames, times and thresholds, and to enerf-paper its box and batch."""
 
 BASELINES = (
     "nerf-sharp",

@@ -11,15 +11,16 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
+from statistics import median
 from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numba
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 import enerf_ns
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment
@@ -33,6 +34,7 @@ from enerf_ns.evaluation.runs import method_config, set_up, train
 from enerf_ns.numerics.parts import error_of_parts
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.stopwatch import seconds_of
 
 FULL_SIZE = (640, 480)
 """Width and height of the simulated sequences at scale 1, pixels."""
@@ -381,16 +383,14 @@ def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
         trial.evaluation_share = 0.0
         trainer = set_up(trial)
         trainer.pipeline.train()
-        start = 0.0
+        device, times = trainer.pipeline.device, []
         for step in range(LATE, LATE + WARM_UP + TIMED):
-            if step == LATE + WARM_UP:
-                start = time.perf_counter()
-            trainer.train_iteration(step)
+            times.append(seconds_of(lambda step=step: trainer.train_iteration(step), device))
             for callback in trainer.callbacks:
-                callback.func(step)
-            if trainer.pipeline.device.type == "cuda":
-                torch.cuda.synchronize()
-        return max(1, round(amount * TIMED / (time.perf_counter() - start)))
+                callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        # a pair of steps, of which the proposal network learns at one; the median, which a hiccup does not move
+        pairs = [sum(pair) for pair in zip(times[WARM_UP::2], times[WARM_UP + 1 :: 2], strict=True)]
+        return max(1, round(amount / (0.5 * median(pairs))))
 
 
 def code_version() -> str:

@@ -69,10 +69,12 @@ class FrameBatch:
     """Instants at which each pixel is rendered, ns."""
     colours: Float[Tensor, "pixels 3"]
     """Colours that were recorded at the pixels, in [0, 1]."""
+    are_grey: bool
+    """Whether the frames have no colour anywhere."""
 
     def subset(self, chosen: Bool[Tensor, " pixels"]) -> FrameBatch:
         """The pixels that are chosen."""
-        return FrameBatch(self.indices[chosen], self.times[chosen], self.colours[chosen])
+        return FrameBatch(self.indices[chosen], self.times[chosen], self.colours[chosen], self.are_grey)
 
 
 @dataclass(frozen=True)

@@ -391,7 +391,7 @@ class _PixelMoments:
 
     def draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | int, Tensor | int]:
         """Pixels, instants, and the first and the last instant of the stretches that these lie in."""
-        device = generator.device
+        device = self._pixels.device
         pixels = self._pixels[torch.randint(len(self._pixels), (number,), generator=generator, device=device)]
         if self._stretches is None:
             instant = torch.randint(self.start_ns, self.end_ns + 1, (number,), generator=generator, device=device)

@@ -81,9 +81,9 @@ def frame_loss(rendered: Float[Tensor, "rays 3"], recorded: Float[Tensor, "rays 
     Args:
         rendered: What the field shows, 0 or more.
         recorded: What the frames show, in [0, 1].
-        grey: Compare brightness alone (luma), as where the field is grey; frames that are grey are always compared so.
+        grey: Compare brightness alone (luma), as where the field is grey, or the frames are.
     """
     rendered = torch.where(recorded >= 1.0, rendered.clamp(max=1.0), rendered)
-    if grey or (recorded == recorded[..., :1]).all():
+    if grey:
         rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
     return torch.mean((rendered - recorded) ** 2)

@@ -35,7 +35,7 @@ def test_a_batch_knows_whether_its_pairs_begin_at_events_whatever_becomes_of_it(
 
 def frames_of(pixels: int, instants: int) -> FrameBatch:
     times = torch.zeros(pixels, instants, dtype=torch.int64)
-    return FrameBatch(torch.zeros(pixels, 3, dtype=torch.int64), times, torch.zeros(pixels, 3))
+    return FrameBatch(torch.zeros(pixels, 3, dtype=torch.int64), times, torch.zeros(pixels, 3), False)
 
 
 def test_what_was_rendered_is_taken_apart_as_its_rays_were_put_together():
