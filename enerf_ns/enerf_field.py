@@ -80,7 +80,8 @@ class HashDensity(nn.Module):
         contraction: Reach beyond the box, which lies within [-1, 1], to infinity (mip-NeRF 360, Barron et al., CVPR
             2022).
         num_features: Outputs beside the density.
-        init_density: Density before training, in 1 / scene unit; small, so that training starts without fog.
+        init_density: Density before training, in 1 / scene unit: about as much as lets half of the light through, since a
+            field that starts transparent draws a negative of the scene by its holes, before a bright background.
         backend: What computes the hash grid, as of `fitting` in `enerf_ns.encodings.hash_grid`.
     """
 
@@ -95,7 +96,7 @@ class HashDensity(nn.Module):
         hidden_dim: int,
         contraction: bool = False,
         num_features: int = 0,
-        init_density: float = 0.01,
+        init_density: float = 1.0,
         backend: str = "auto",
     ):
         super().__init__()

@@ -31,7 +31,7 @@ CONFIGURATIONS = {
     "silent pixels": ({**SILENT, "model__no_event_margin": 1.0}, {*EVENTS, "no_event_loss"}),
     "total variation": ({**SILENT, "model__no_event_margin": 0.0}, {*EVENTS, "no_event_loss"}),
     "silent intervals": ({**SILENT, "data__silent_mode": "intervals"}, {*EVENTS, "no_event_loss"}),
-    "no pixel is silent so long": ({**SILENT, "data__silence_ms": 1e4}, EVENTS),
+    "no pixel is silent so long": ({**SILENT, "data__silence_ms": 1e4}, {*EVENTS, "no_event_loss"}),
     "frames": ({"data__supervision": "frames"}, {"frame_loss", "distortion_loss", "interlevel_loss"}),
     "events and frames": ({"data__supervision": "events+frames"}, {*EVENTS, "frame_loss"}),
     "all losses": (
@@ -97,6 +97,20 @@ def test_two_steps_of_the_setting_of_the_paper(recording: Path, tmp_path: Path, 
     config = small_config(recording, tmp_path, method=enerf_paper, data__supervision=supervision)
     assert config.pipeline.model.sampling == "uniform" and config.pipeline.model.view_direction
     check_two_steps(config, {"event_loss", "distortion_loss", *frame_loss})
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_early_field_is_no_negative_whose_brightness_is_that_of_holes(recording: Path, tmp_path: Path, seed: int):
+    """As one that starts transparent is before a bright background: its correlation is -0.9 after 50 steps."""
+    config = small_config(recording, tmp_path, data__held_out_events=0.0, data__event_pairs=256, data__silent_pairs=64)
+    config.pipeline.model.opacity_loss_weight, config.machine.seed = 1.0, seed
+    config.pipeline.model.num_levels, config.pipeline.model.log2_table_size = None, 17
+    config.max_num_iterations = 2000
+    trainer = set_up(config)
+    for step in range(50):
+        trainer.train_iteration(step)
+    assert trainer.pipeline.event_scores(2048)["event_correlation"] > 0.8
+    assert trainer.pipeline.last_step.accumulation.mean() > 0.9
 
 
 @pytest.mark.parametrize("supervision", ["events+frames", "frames"])
