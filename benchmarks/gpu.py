@@ -120,9 +120,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         shapes, carpet = folder / "shapes", folder / "shake-carpet1"
-        small = {"width": 32, "height": 24} if flags.small else {}
-        simulate(SimulationSettings("shapes", **small), shapes)
-        simulate(SimulationSettings("shake-carpet1", **small), carpet)
+        width = 32 if flags.small else None
+        simulate(SimulationSettings("shapes", width=width), shapes)
+        simulate(SimulationSettings("shake-carpet1", width=width), carpet)
 
         def config(method: str, recording: Path, changes: Mapping[str, Any] = {}) -> Any:
             found = method_config(method, recording, folder / "runs", {"machine.device_type": flags.device, **changes})

@@ -143,7 +143,7 @@ class Trajectory:
         segment = torch.searchsorted(knots, flat, right=True).sub_(1).clamp_(max=len(angles) - 1)
         passed = (flat - knots[segment]).double()
         if flat.device.type != "cpu":
-            passed = passed.where(self.covers(flat), torch.nan)
+            passed = passed.where((flat >= self.start) & (flat <= self.end), torch.nan)
         if fraction is not None:
             passed = passed + fraction
         duration = (knots[1:] - knots[:-1])[segment]

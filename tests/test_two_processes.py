@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed
-import torch.multiprocessing
 from small_runs import set_up, small_config
+from torch.multiprocessing.spawn import spawn
 
 STEPS = 4
 
@@ -39,7 +39,7 @@ def train_one_of_two(rank: int, recording: Path, folder: Path) -> None:
 
 @pytest.mark.slow
 def test_two_processes_train_as_one_would_with_both_batches(recording: Path, tmp_path: Path) -> None:
-    torch.multiprocessing.spawn(train_one_of_two, (recording, tmp_path), nprocs=2)
+    spawn(train_one_of_two, (recording, tmp_path), nprocs=2)
     one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     trainers, states = [], []
     for rank in (0, 1):

@@ -353,8 +353,9 @@ class AccumulationSampler:
             self._of_fired.pairs(fired, batch_size - negatives, generator),
             self._of_any.pairs(windows, negatives, generator),
         )
-        columns = (torch.cat(both) for both in zip(*(batch.columns for batch in found), strict=True))
-        return EventBatch(*columns, starts_at_events=False)
+        columns = zip(*(batch.columns for batch in found), strict=True)
+        pixels, start, end, on, off = (torch.cat(both) for both in columns)
+        return EventBatch(pixels, start, end, on, off, starts_at_events=False)
 
     def _windows(self, draws: int, generator: torch.Generator) -> EventBatch:
         """Windows of any length, also 0, at any pixel."""

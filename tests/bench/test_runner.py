@@ -258,7 +258,7 @@ def test_seconds_become_as_many_steps_as_fit(finished: Path, tmp_path: Path, mon
         return train_iteration(self, step)
 
     monkeypatch.setattr(EnerfTrainer, "train_iteration", counted)
-    monkeypatch.setattr(runner.time, "perf_counter", lambda: 0.1 * steps)
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.1 * steps)
     run = bench(finished)
     config = run._config(run.cells[0], tmp_path)
     assert steps_of("50s", config) == 500 and steps_of("7", config) == 7
