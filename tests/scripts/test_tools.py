@@ -198,7 +198,7 @@ def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pyt
     config = yaml.load(file.read_text(), Loader=yaml.Loader)
     used = config.pipeline.resolution.applied_to(config.pipeline)
     assert used.model.sensor.contrast_thresholds == (0.2, 0.2)
-    assert used.datamanager.dataparser.box == (0.0, 0.0, -1.0, 10.0)
+    assert used.datamanager.dataparser.held_out_frame_indices == tuple(range(1, 40, 2))
     call("ns-eval", "--load-config", file, "--output-path", "scores.json", "--render-output-path", "pictures")
     assert len(list(Path("pictures").iterdir())) == 20
 
