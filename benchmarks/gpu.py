@@ -10,9 +10,12 @@ with all that goes with it. --small shrinks everything, to try the script itself
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import gc
 import json
 import statistics
+import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -117,7 +120,8 @@ def main() -> None:
         if flags.json:
             flags.json.write_text(json.dumps(results, indent=1))
 
-    with tempfile.TemporaryDirectory() as temporary:
+    tell = functools.partial(print, file=sys.stdout)  # the tables alone; what training says goes to stderr
+    with contextlib.redirect_stdout(sys.stderr), tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         shapes, carpet = folder / "shapes", folder / "shake-carpet1"
         width = 32 if flags.small else None
@@ -129,7 +133,7 @@ def main() -> None:
             found.timestamp = f"{method}-{len(list((folder / 'runs').glob('*/*/*')))}"
             return found
 
-        print(f"PyTorch {torch.__version__}, {device}\n")
+        tell(f"PyTorch {torch.__version__}, {device}\n")
         many = {f"pipeline.datamanager.{name}": 128 if flags.small else pairs for name, pairs in PAPER_PAIRS.items()}
         steps = results["steps"] = []
         for name, method, changes in (("enerf", "enerf", {}), ("enerf, 30096 pairs", "enerf", many)):
@@ -138,11 +142,11 @@ def main() -> None:
         steps.append(step_by_part("enerf-paper", config("enerf-paper", shapes, many if flags.small else {})))
         store()
         names = list(steps[0]["parts_ms"])
-        print(f"| setting | rays a step | a step, ms | {' | '.join(names)} | peak memory, GB |")
-        print("|---" * (len(names) + 4) + "|")
+        tell(f"| setting | rays a step | a step, ms | {' | '.join(names)} | peak memory, GB |")
+        tell("|---" * (len(names) + 4) + "|")
         for step in steps:
             parts = " | ".join(f"{step['parts_ms'][name]:.1f}" for name in names)
-            print(f"| {step['setting']} | {step['rays']} | {step['ms']:.1f} | {parts} | {step['peak_gb']:.2f} |")
+            tell(f"| {step['setting']} | {step['rays']} | {step['ms']:.1f} | {parts} | {step['peak_gb']:.2f} |")
 
         budgets = ("2s", "2s") if flags.small else ("60s", "150s")
         runs = results["runs"] = []
@@ -151,14 +155,14 @@ def main() -> None:
             found, run = error_against_time(recording.name, config("enerf", recording, {"preset": preset}), budget)
             runs.append(found | {"pictures_a_second": pictures_a_second(run)})
             store()
-        print(
+        tell(
             f"\n| recording | training, s | steps | PSNR, dB | {' | '.join(f'{t:g} dB, s' for t in TARGETS)} |", end=""
         )
-        print(" pictures of 640 x 480 a second |")
-        print("|---" * (len(TARGETS) + 5) + "|")
+        tell(" pictures of 640 x 480 a second |")
+        tell("|---" * (len(TARGETS) + 5) + "|")
         for found in runs:
             reached = " | ".join("-" if s is None else f"{s:.1f}" for s in found["seconds_to"].values())
-            print(
+            tell(
                 f"| {found['recording']} | {found['seconds']:.0f} | {found['steps']} | "
                 f"{found['scores'].get('psnr', float('nan')):.2f} | {reached} | {found['pictures_a_second']:.2f} |"
             )
