@@ -80,8 +80,7 @@ class HashDensity(nn.Module):
         contraction: Reach beyond the box, which lies within [-1, 1], to infinity (mip-NeRF 360, Barron et al., CVPR
             2022).
         num_features: Outputs beside the density.
-        init_density: Density before training, in 1 / scene unit: about as much as lets half of the light through. A
-            field that starts transparent first draws a negative of the scene, by its holes before a bright background.
+        init_density: Density before training, in 1 / scene unit.
         backend: What computes the hash grid, as of `fitting` in `enerf_ns.encodings.hash_grid`.
     """
 

@@ -92,6 +92,9 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
     interlevel_loss_weight: float = 1.0
     """Weight of the loss by which the proposal network learns."""
+    init_density: float = 1.0
+    """Density before training, in 1 / scene unit. A field that starts transparent first draws a negative of the scene,
+    by its holes before the bright background."""
     contraction: Optional[bool] = None  # noqa: UP045
     """Contract the space beyond the box towards infinity, as mip-NeRF 360 does; without it nothing lies there. None:
     where a share of the events comes from beyond the box."""
@@ -99,13 +102,14 @@ class EnerfModelConfig(ModelConfig):
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before the sensor had a config of its own, and before contraction, too."""
+        """Reads config.yml of runs from before the sensor had a config of its own, before contraction, and before
+        fields started half opaque, too."""
         thresholds = state.pop("contrast_thresholds", None)
         if "sensor" not in state:
             state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
         if "hidden_dim_color" in state:
             state["hidden_dim_colour"] = state.pop("hidden_dim_color")
-        self.__dict__.update({"contraction": False, **state})
+        self.__dict__.update({"contraction": False, "init_density": 0.01, **state})
 
 
 class BoxCollider(AABBBoxCollider):
@@ -164,6 +168,7 @@ class EnerfModel(Model):
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
             contraction=config.contraction,
+            init_density=config.init_density,
             backend=config.hash_grid,
         )
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
@@ -179,6 +184,7 @@ class EnerfModel(Model):
                 log2_table_size=15,
                 hidden_dim=16,
                 contraction=config.contraction,
+                init_density=config.init_density,
                 backend=config.hash_grid,
             )
             self.sampler = ProposalNetworkSampler(

@@ -101,6 +101,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "distortion_loss_weight": WEIGHT,
     "interlevel_loss_weight": WEIGHT,
     "near_plane": (0.0, 1e3),
+    "init_density": (1e-6, 1e6),
 }
 """Lowest and highest value of each number, or of each of some numbers, by the name of its field in the config."""
 

@@ -89,7 +89,7 @@ def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, t
     model = state.model.__dict__
     model["contrast_thresholds"] = model.pop("sensor").contrast_thresholds
     model["hidden_dim_color"] = model.pop("hidden_dim_colour") + 8
-    del model["contraction"]
+    del model["contraction"], model["init_density"]
     del state.__dict__["defaults"], state.__dict__["resolution"]
     loaded = yaml.load(yaml.dump(state), Loader=yaml.Loader)
     assert loaded.model.sensor.contrast_thresholds == (0.3, 0.2)
@@ -98,6 +98,7 @@ def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, t
     assert pipeline.model.sensor.response == Linlog()
     assert pipeline.config.model.hidden_dim_colour == old.model.hidden_dim_colour + 8
     assert pipeline.config.model.max_res == old.model.max_res and pipeline.config.model.contraction is False
+    assert pipeline.config.model.init_density == 0.01 == pipeline.model.field.geometry.init_density
 
 
 def test_without_data_it_says_which_flag_is_missing(tmp_path: Path):
