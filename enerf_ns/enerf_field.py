@@ -81,7 +81,7 @@ class HashDensity(nn.Module):
             2022).
         num_features: Outputs beside the density.
         init_density: Density before training, in 1 / scene unit.
-        backend: What computes the hash grid, as of `fitting` in `enerf_ns.encodings.hash_grid`.
+        backend: What computes the hash grid, as of `backend_of` in `enerf_ns.encodings.hash_grid`.
     """
 
     def __init__(
@@ -122,16 +122,19 @@ class HashDensity(nn.Module):
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
         """Density in 1 / scene unit, and the features."""
         if self.contraction is not None:
-            output = self.network(self.grid(0.5 + 0.25 * self.contraction(positions)))
-            return self.init_density * limited_exp(widened(output[..., :1])), output[..., 1:]
-        unit = SceneBox.get_normalized_positions(positions, self.aabb)
-        inside = ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
-        output = self.network(self.grid(unit.clamp(0.0, 1.0)))
-        density = self.init_density * limited_exp(widened(output[..., :1])) * inside
+            unit = 0.5 + 0.25 * self.contraction(positions)
+        else:
+            unit = SceneBox.get_normalized_positions(positions, self.aabb)
+        # rows of a matrix: where there are more axes, PyTorch multiplies in another way, which is slower
+        output = self.network(self.grid(unit.clamp(0.0, 1.0).view(-1, 3)))
+        output = output.view(*positions.shape[:-1], output.shape[-1])
+        density = self.init_density * limited_exp(widened(output[..., :1]))
+        if self.contraction is None:
+            density = density * ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
         return density, output[..., 1:]
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
-        """Density alone, as Nerfstudio's proposal sampler asks for it."""
+        """Density alone."""
         return self(positions)[0]
 
 
@@ -159,6 +162,7 @@ class EnerfField(Field):
         **density,
     ):
         super().__init__()
+        self.num_channels = num_channels
         self.brightness: Brightness = brightness
         self.geometry = HashDensity(aabb, num_features=num_features, **density)
         self.direction_encoding = SHEncoding(levels=4, implementation="torch") if view_direction else None
@@ -181,9 +185,13 @@ class EnerfField(Field):
     def get_outputs(self, ray_samples: RaySamples, density_embedding: Tensor | None = None) -> dict:
         """Brightness, shape (*batch, num_channels): 0 or more, and at most 1 but where it is exponential."""
         assert density_embedding is not None
-        inputs = density_embedding
+        directions = ray_samples.frustums.directions.reshape(-1, 3)
+        colour = self.colour(density_embedding.reshape(len(directions), density_embedding.shape[-1]), directions)
+        return {FieldHeadNames.RGB: colour.view(*density_embedding.shape[:-1], self.num_channels)}
+
+    @full_precision
+    def colour(self, features: Float[Tensor, "points features"], directions: Float[Tensor, "points 3"]) -> Tensor:
+        """Brightness, shape (points, num_channels), of points with these features seen along these directions."""
         if self.direction_encoding is not None:
-            directions = get_normalized_directions(ray_samples.frustums.directions)
-            encoded = self.direction_encoding(directions.reshape(-1, 3)).view(*directions.shape[:-1], -1)
-            inputs = torch.cat([encoded, inputs], dim=-1)
-        return {FieldHeadNames.RGB: brightness_of(self.colour_network(inputs), self.brightness)}
+            features = torch.cat([self.direction_encoding(get_normalized_directions(directions)), features], dim=-1)
+        return brightness_of(self.colour_network(features), self.brightness)

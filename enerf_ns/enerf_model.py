@@ -9,27 +9,31 @@ from typing import Annotated, Any, Literal, Optional, Type  # noqa: UP035 - tyro
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
+from enerf_ns.encodings.hash_grid import backend_of
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 from enerf_ns.events.batch import FrameBatch, TrainBatch
+from enerf_ns.front_to_back import front_to_back
 from enerf_ns.memory import in_parts
-from enerf_ns.ray_samplers import PairedPDFSampler, PairedPiecewiseSampler, PairedUniformSampler, paired_rand
+from enerf_ns.ray_samplers import PairedPiecewiseSampler, PairedProposalSampler, PairedUniformSampler, paired_rand
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.event_supervision import EventSupervision
 from enerf_ns.supervision.losses import frame_loss
+
+FAINT = 5e-4
+"""Share of a ray's light that a picture may miss for what lies behind, and as much for what is thin."""
 
 FARTHEST = 1000.0
 """Where rays end that go on beyond the box, in scene units: halves of its longest side."""
@@ -127,6 +131,16 @@ class BoxCollider(AABBBoxCollider):
         return ray_bundle
 
 
+class Outputs(dict[str, Any]):
+    """What rays show, by name; what is a function is called when it is first asked for, by its name."""
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Any = super().__getitem__(name)
+        if callable(value):
+            self[name] = value = value()
+        return value
+
+
 class EnerfModel(Model):
     """Hash-grid radiance field whose changes of log brightness explain the events of a camera."""
 
@@ -171,6 +185,8 @@ class EnerfModel(Model):
             init_density=config.init_density,
             backend=config.hash_grid,
         )
+        # what has no upper end shines through anything
+        self._faint = 0.0 if config.brightness == "exponential" else FAINT
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
         self.proposal = None
         if config.sampling == "proposal":
@@ -187,13 +203,8 @@ class EnerfModel(Model):
                 init_density=config.init_density,
                 backend=config.hash_grid,
             )
-            self.sampler = ProposalNetworkSampler(
-                num_proposal_samples_per_ray=(config.num_proposal_samples,),
-                num_nerf_samples_per_ray=config.num_samples,
-                num_proposal_network_iterations=1,
-                initial_sampler=first_sampler(single_jitter=True),
-                pdf_sampler=PairedPDFSampler(single_jitter=True),
-                update_sched=lambda step: 1 if step > 500 else 0,
+            self.sampler = PairedProposalSampler(
+                config.num_proposal_samples, config.num_samples, first_sampler(single_jitter=True), self._faint
             )
         else:
             self.sampler = first_sampler(num_samples=config.num_samples)
@@ -209,7 +220,7 @@ class EnerfModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        if not isinstance(self.sampler, ProposalNetworkSampler):
+        if not isinstance(self.sampler, PairedProposalSampler):
             return []
         return [
             TrainingCallback(
@@ -228,31 +239,69 @@ class EnerfModel(Model):
         Returns:
             rgb (rays, 3), at most 1 but where brightness is exponential, and accumulation (rays, 1). In training rgb
             has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in scene
-            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1].
+            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1], which are computed when they are
+            asked for, by their name.
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
-        if self.proposal is not None:
-            samples, weights_list, samples_list = self.sampler(ray_bundle, density_fns=[self.proposal.density_fn])
-        else:
-            samples, weights_list, samples_list = self.sampler(ray_bundle), [], []
+        if not self.training:
+            return self._picture(ray_bundle)
+        samples, weights_list, samples_list = self._samples(ray_bundle)
         field_outputs = in_parts(self.field, samples, self.samples_at_once)
         weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
         accumulation = self.renderer_accumulation(weights=weights)
-        rgb = field_outputs[FieldHeadNames.RGB]
-        background = paired_rand(ray_bundle, 1) if self.training else torch.zeros_like(accumulation)
-        colour = torch.sum(weights * rgb, dim=-2) + (1.0 - accumulation) * background
-        if self.training:
-            return {
-                "rgb": colour,
-                "accumulation": accumulation,
-                "weights_list": [*weights_list, weights],
-                "ray_samples_list": [*samples_list, samples],
-            }
-        with torch.no_grad():
+        background = (1.0 - accumulation) * paired_rand(ray_bundle, 1)
+        return {
+            "rgb": torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + background,
+            "accumulation": accumulation,
+            "weights_list": [*weights_list, weights],
+            "ray_samples_list": [*samples_list, samples],
+        }
+
+    def _samples(self, rays: RayBundle) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
+        """Samples along rays, and weights and samples of the proposal network."""
+        if self.proposal is None:
+            return self.sampler(rays), [], []
+        return self.sampler(rays, density_fns=[self.proposal])
+
+    def _picture(self, rays: RayBundle) -> Outputs:
+        """What rays show, from the camera on until hardly any light is left, and the colour only of what it comes
+        from."""
+        grid = self.field.geometry.grid
+        if backend_of(grid.backend, rays.origins, grid.table) == "numba" and not torch.is_grad_enabled():
+            from enerf_ns.rendering_numba import render  # here, since Numba may be missing
+
+            rgb, accumulation, depth = render(rays, self.field, self.sampler, self.proposal, self._faint)
+        else:
+            samples, _, _ = self._samples(rays)
+            rgb = rays.origins.new_zeros(len(rays), self.field.num_channels)
+
+            def see(ray: Tensor, weight: Tensor, features: Tensor) -> None:
+                rgb.index_add_(0, ray, weight * self.field.colour(features, rays.directions[ray]))
+
+            weights = front_to_back(samples, self.field.geometry, self._faint, see, self.samples_at_once)
+            accumulation = self.renderer_accumulation(weights=weights)
             depth = self.renderer_depth(weights=weights, ray_samples=samples)
-            normals = self.normals(ray_bundle.origins + ray_bundle.directions * depth)
-        return {"rgb": colour.expand(-1, 3), "accumulation": accumulation, "depth": depth, "normals": normals}
+        return Outputs(
+            rgb=rgb.expand(-1, 3),
+            accumulation=accumulation,
+            depth=depth,
+            normals=lambda: self.normals(rays.origins + rays.directions * depth),
+        )
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Outputs:
+        """What the rays of a picture show, each of shape (height, width, its size); normals where they are asked for,
+        by their name."""
+        outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
+
+        def normals() -> Tensor:
+            points = camera_ray_bundle.origins + camera_ray_bundle.directions * outputs["depth"]
+            chunks = points.reshape(-1, 3).split(self.config.eval_num_rays_per_chunk)
+            found = [self.normals(chunk.to(self.device)).to(points.device) for chunk in chunks]
+            return torch.cat(found).view(points.shape)
+
+        outputs["normals"] = normals
+        return outputs
 
     @torch.no_grad()
     def normals(self, points: Tensor) -> Tensor:
@@ -332,7 +381,8 @@ class EnerfModel(Model):
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """What the viewer and ns-render show of a camera: above 1 brightness is white, where it would wrap round."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
-        return outputs | {"rgb": outputs["rgb"].clamp(max=1.0)}
+        outputs["rgb"] = outputs["rgb"].clamp(max=1.0)
+        return outputs
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import (
     PDFSampler,
+    ProposalNetworkSampler,
     SpacedSampler,
     UniformLinDispPiecewiseSampler,
     UniformSampler,
 )
 from torch import Tensor
+
+from enerf_ns.front_to_back import front_to_back
 
 
 @dataclass
@@ -116,6 +121,54 @@ class PairedPDFSampler(PDFSampler):
         first, second = bins.gather(-1, below), bins.gather(-1, above)
         bins = (first + share * (second - first)).detach()
         return _samples(ray_bundle, bins, ray_samples.spacing_to_euclidean_fn)
+
+
+class PairedProposalSampler(ProposalNetworkSampler):
+    """Samples where one proposal network expects surfaces; in training, where it does along one ray of a pair.
+
+    Two rays of a pair are one pixel's, moments apart, and see nearly the same surfaces.
+
+    Args:
+        num_proposal_samples: Of the proposal network, along a ray.
+        num_samples: Along a ray.
+        initial_sampler: Places the samples of the proposal network.
+        faint: Share of a ray's light behind which the proposal network is not asked, but in training.
+    """
+
+    def __init__(self, num_proposal_samples: int, num_samples: int, initial_sampler: SpacedSampler, faint: float):
+        super().__init__(
+            num_proposal_samples_per_ray=(num_proposal_samples,),
+            num_nerf_samples_per_ray=num_samples,
+            num_proposal_network_iterations=1,
+            initial_sampler=initial_sampler,
+            pdf_sampler=PairedPDFSampler(single_jitter=True),
+            update_sched=lambda step: 1 if step > 500 else 0,
+        )
+        self.faint = faint
+
+    def generate_ray_samples(
+        self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
+    ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
+        """Samples, and the weights and the samples of the proposal network, in lists.
+
+        Args:
+            ray_bundle: With nears and fars.
+            density_fns: The proposal network alone: density and features at positions.
+        """
+        assert ray_bundle is not None and density_fns is not None
+        (proposal,) = density_fns
+        if self.training:
+            pairs = getattr(ray_bundle, "num_pairs", 0)
+
+            def density(positions: Tensor) -> Tensor:
+                found = proposal(positions[pairs:])[0]
+                return torch.cat([found[:pairs], found]) if pairs else found
+
+            return super().generate_ray_samples(ray_bundle, [density])
+        samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
+        weights = front_to_back(samples, proposal, self.faint)
+        found = self.pdf_sampler(ray_bundle, samples, weights, num_samples=self.num_nerf_samples_per_ray)
+        return found, [weights], [samples]
 
 
 def _samples(rays: RayBundle, bins: Float[Tensor, "rays edges"], to_distance) -> RaySamples:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
@@ -51,7 +52,7 @@ def test_what_is_rendered_has_the_shapes_that_nerfstudio_asks_for(pipeline: Any)
         outputs = pipeline.model(rays)
     assert next(iter(outputs)) == "rgb"
     sizes = {"rgb": 3, "accumulation": 1, "depth": 1, "normals": 3}
-    assert {name: tuple(output.shape) for name, output in outputs.items()} == {
+    assert {name: tuple(outputs[name].shape) for name in outputs} == {
         name: (len(rays), size) for name, size in sizes.items()
     }
     torch.testing.assert_close(outputs["normals"].mul(2).sub(1).norm(dim=-1), torch.ones(len(rays)), atol=1e-3, rtol=0)
@@ -185,7 +186,60 @@ def test_with_contraction_what_lies_beyond_the_box_is_learnt(recording: Path, tm
     rays = RayBundle(torch.full((2, 3), 5.0), torch.eye(3)[:2], lengths, metadata={"directions_norm": lengths})
     with torch.no_grad():
         outputs = pipeline.model(rays)
-    assert (outputs["rgb"] > 0).all() and all(output.isfinite().all() for output in outputs.values())
+    assert (outputs["rgb"] > 0).all() and all(outputs[name].isfinite().all() for name in outputs)
+
+
+PICTURES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "colour": {"num_channels": 3, "view_direction": True},
+    "contraction": {"contraction": True},
+    "uniform": {"sampling": "uniform", "num_samples": 21, "brightness": "sigmoid"},
+    "bright": {"brightness": "exponential"},
+}
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch", "torch, 40 samples at once"])
+@pytest.mark.parametrize("setting", PICTURES)
+def test_a_picture_is_the_sum_over_all_samples(recording: Path, tmp_path: Path, setting: str, backend: str):
+    """Though the field is not asked for what lies behind, nor for the colour of what is thin."""
+    settings = {f"model__{name}": value for name, value in PICTURES[setting].items()}
+    config = small_config(recording, tmp_path, **settings, model__hash_grid=backend.split(",")[0])
+    pipeline = set_up(config).pipeline
+    model = pipeline.model
+    _, rays = rays_of(pipeline)
+    pipeline.eval()
+    torch.manual_seed(0)
+    torch.nn.init.normal_(model.field.geometry.grid.table, std=4.0)  # free, thin and dense by turns
+    rays = model.collider(rays)
+    if model.proposal is None:
+        samples = model.sampler(rays)
+    else:
+        torch.nn.init.normal_(model.proposal.grid.table, std=4.0)
+        even = model.sampler.initial_sampler(rays, num_samples=model.config.num_proposal_samples)
+        weights = even.get_weights(model.proposal.density_fn(even.frustums.get_positions()))
+        samples = model.sampler.pdf_sampler(rays, even, weights, num_samples=model.config.num_samples)
+    field = model.field(samples)
+    weights = samples.get_weights(field[FieldHeadNames.DENSITY])
+    model.samples_at_once = 40 if "40" in backend else None
+    with torch.no_grad():
+        outputs = model(rays)
+    assert 0.01 < weights.sum(dim=1).mean() < 0.999
+    expected = (weights * field[FieldHeadNames.RGB]).sum(dim=1).expand(-1, 3)
+    torch.testing.assert_close(outputs["rgb"], expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(outputs["accumulation"], weights.sum(dim=1), rtol=0, atol=1e-3)
+    depth = model.renderer_depth(weights=weights, ray_samples=samples)
+    assert ((outputs["depth"] - depth).abs() < 1e-3 * depth).float().mean() > 0.99  # a median may jump by a sample
+
+
+def test_normals_of_a_picture_are_those_of_its_rays(pipeline: Any):
+    pipeline.eval()
+    rays = pipeline.datamanager.eval_dataset.cameras[:1].generate_rays(camera_indices=0, keep_shape=True)
+    with torch.no_grad():
+        picture = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+        by_rays = pipeline.model(rays.flatten())
+    torch.testing.assert_close(picture["normals"].view(-1, 3), by_rays["normals"])
+    assert picture["normals"].std() > 0
+    pipeline.train()
 
 
 def test_a_picture_without_depth_is_shown(pipeline: Any):
@@ -202,5 +256,5 @@ def test_a_ray_that_misses_the_box_is_black_and_nothing(pipeline: Any):
     with torch.no_grad():
         outputs = pipeline.model(rays)
     assert (outputs["accumulation"] == 0).all() and (outputs["rgb"] == 0).all()
-    assert all(output.isfinite().all() for output in outputs.values())
+    assert all(outputs[name].isfinite().all() for name in outputs)
     pipeline.train()

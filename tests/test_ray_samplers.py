@@ -18,6 +18,7 @@ from enerf_ns.enerf_model import BoxCollider
 from enerf_ns.ray_samplers import (
     PairedPDFSampler,
     PairedPiecewiseSampler,
+    PairedProposalSampler,
     PairedRayBundle,
     PairedUniformSampler,
     paired_rand,
@@ -150,3 +151,44 @@ def test_rays_start_at_the_near_plane_and_end_at_the_box(training: bool):
     torch.testing.assert_close(rays.nears[:2, 0], torch.tensor([0.25, 2.0]))
     torch.testing.assert_close(rays.fars[:2, 0], torch.tensor([1.0, 4.0]))
     assert (rays.fars > rays.nears).all() and rays.fars.isfinite().all()
+
+
+@pytest.mark.parametrize("pairs", [0, PAIRS])
+def test_the_proposal_network_is_asked_along_one_ray_of_a_pair(pairs: int):
+    """And says the same of both, as far as they go through the same space; else as Nerfstudio's sampler."""
+    rays = replace(paired_rays(), num_pairs=pairs)
+    asked = []
+
+    def proposal(positions: Tensor) -> tuple[Tensor, Tensor]:
+        asked.append(positions.shape[:-1])
+        return density(positions), positions[..., :0]
+
+    torch.manual_seed(1)
+    sampler = PairedProposalSampler(12, 8, PairedUniformSampler(single_jitter=True), faint=0.0).train()
+    samples, (weights,), _ = sampler(rays, density_fns=[proposal])
+    assert asked == [(len(rays) - pairs, 12)]
+    torch.manual_seed(1)
+    expected = proposal_samples(rays, single_jitter=True)
+    torch.testing.assert_close(samples.frustums.starts, expected.frustums.starts)
+    assert weights.shape == (len(rays), 12, 1)
+
+
+def test_behind_what_is_opaque_the_proposal_network_is_not_asked_in_pictures():
+    rays = paired_rays()
+    asked = 0
+
+    def wall(positions: Tensor) -> Tensor:
+        return 1e3 * (positions.norm(dim=-1, keepdim=True) > 0.5)
+
+    def proposal(positions: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal asked
+        asked += positions.shape[:-1].numel()
+        return wall(positions), positions[..., :0]
+
+    initial, pdf = PairedUniformSampler().eval(), PairedPDFSampler().eval()
+    sampler = PairedProposalSampler(64, 8, initial, faint=1e-3).eval()
+    samples, (weights,), (even,) = sampler(rays, density_fns=[proposal])
+    expected = even.get_weights(wall(even.frustums.get_positions()))
+    torch.testing.assert_close(weights, expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(samples.frustums.starts, pdf(rays, even, expected, 8).frustums.starts)
+    assert asked < 0.5 * 64 * len(rays)

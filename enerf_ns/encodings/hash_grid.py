@@ -96,8 +96,8 @@ BACKENDS: dict[str, Backend] = {
 """Backends by name, beside "torch", which is `hash_grid` and fits everything."""
 
 
-def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function of a backend, for some positions and a table.
+def backend_of(name: str, x: Tensor, table: Tensor) -> str:
+    """The name of the backend that computes the grid for some positions and a table.
 
     Args:
         name: "torch", one of `BACKENDS`, or "auto": of these the first that fits, else "torch".
@@ -114,10 +114,16 @@ def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Te
             continue
         misfits = {backend.misfit(tensor.device.type, tensor.dtype, table.shape[1]) for tensor in (x, table)} - {None}
         if not misfits:
-            return importlib.import_module(backend.module).hash_grid
+            return found
         if name == found:
             raise ValueError(f'backend "{name}" needs {misfits.pop()}; use "auto"')
-    return hash_grid
+    return "torch"
+
+
+def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """The function of the backend of `backend_of`."""
+    found = backend_of(name, x, table)
+    return hash_grid if found == "torch" else importlib.import_module(BACKENDS[found].module).hash_grid
 
 
 class HashGrid(nn.Module):
@@ -135,7 +141,7 @@ class HashGrid(nn.Module):
         log2_table_size: each level has 2**log2_table_size rows.
         features_per_level: numbers in one row.
         init_scale: the table starts uniform in [-init_scale, init_scale).
-        backend: as of `fitting`; chosen at each call.
+        backend: as of `backend_of`; chosen at each call.
     """
 
     scalings: Tensor

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from torch import Tensor
 
 from enerf_ns.dataparsers.camera import Camera
@@ -23,6 +22,7 @@ from enerf_ns.evaluation.metrics import psnr
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL
 from enerf_ns.evaluation.views import aligned_views, held_out_views
 from enerf_ns.numerics.case import shown
+from enerf_ns.ray_samplers import PairedProposalSampler
 from enerf_ns.sensor.response import linlog, luma
 from enerf_ns.supervision.event_supervision import brightness_change
 
@@ -162,7 +162,7 @@ def _samples(model: EnerfModel, number: int, even: bool) -> Iterator[None]:
     same proportion."""
     before, proposal = model.sampler, model.proposal
     sampler: Any = copy.copy(before)
-    if not isinstance(sampler, ProposalNetworkSampler):
+    if not isinstance(sampler, PairedProposalSampler):
         sampler.num_samples = number
     elif even:
         sampler = copy.copy(sampler.initial_sampler)

@@ -1,0 +1,346 @@
+"""Pictures on the CPU: some rays at a time go from their samples to their brightness while all of it is in the cache.
+
+The sum that `enerf_ns.front_to_back` and the field compute with PyTorch, which writes every number on the way to
+memory. Samples of several rays go through hash grid and networks in blocks, by vector instructions.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.fields.base_field import get_normalized_directions
+from torch import Tensor, nn
+
+from enerf_ns.compiled import compiled
+from enerf_ns.encodings.hash_grid_numba import BLOCK, find_cells, interpolate, new_cells, on_threads
+from enerf_ns.enerf_field import DARKEST, LARGEST_EXPONENT, EnerfField, HashDensity
+from enerf_ns.ray_samplers import PairedProposalSampler, PairedSpacedSampler
+
+RAYS = 32
+"""Rays that go through together."""
+
+TASK = 8 * RAYS
+"""Rays that a thread takes at a time."""
+
+ROUND = 8
+"""Samples of a ray between two looks at what light is left."""
+
+PADDING = np.float32(0.01)
+"""Added to the weight of each stretch of a ray before it is sampled, as in Nerfstudio's PDFSampler."""
+
+LOG_DARKEST = np.float32(math.log(DARKEST))
+HIGHEST = np.float32(LARGEST_EXPONENT)
+ZERO, QUARTER, HALF, ONE, TWO = np.float32(0), np.float32(0.25), np.float32(0.5), np.float32(1), np.float32(2)
+ACTIVATIONS = ("sigmoid", "log-sigmoid", "exponential")
+"""Numbers, by their place, of what makes brightness, as the kernels know it."""
+
+vectorised = partial(compiled, any_order=True)
+
+
+class Layers(NamedTuple):
+    """A network with ReLU between its layers: weights, each of shape (out, in), and biases."""
+
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+
+class Geometry(NamedTuple):
+    """A `HashDensity`: the levels of its grid, shape (levels, rows, 2), its network, and the box that it fills."""
+
+    levels: np.ndarray
+    scalings: np.ndarray
+    network: Layers
+    init_density: np.float32
+    low: np.ndarray
+    size: np.ndarray
+    contraction: bool
+
+
+@vectorised
+def _layer(weight, bias, inputs, number, outputs):
+    width = weight.shape[1]
+    by_four = width // 4 * 4
+    for j in range(weight.shape[0]):
+        for p in range(number):
+            outputs[j, p] = bias[j]
+        for k in range(0, by_four, 4):
+            w0, w1, w2, w3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            for p in range(number):
+                outputs[j, p] += (
+                    w0 * inputs[k, p] + w1 * inputs[k + 1, p] + w2 * inputs[k + 2, p] + w3 * inputs[k + 3, p]
+                )
+        for k in range(by_four, width):
+            w0 = weight[j, k]
+            for p in range(number):
+                outputs[j, p] += w0 * inputs[k, p]
+
+
+@vectorised
+def _room(layers):
+    """Room for a block's inputs, and for what each layer makes of them."""
+    widest = layers.weights[0].shape[1]
+    for i in range(len(layers.weights)):
+        widest = max(widest, layers.weights[i].shape[0])
+    return np.empty((len(layers.weights) + 1, widest, BLOCK), np.float32)
+
+
+@vectorised
+def _network(layers, number, values):
+    """What the last layer makes of the inputs in values[0]."""
+    last = len(layers.weights) - 1
+    for i in range(last + 1):
+        _layer(layers.weights[i], layers.biases[i], values[i], number, values[i + 1])
+        if i < last:
+            for j in range(layers.weights[i].shape[0]):
+                for p in range(number):
+                    value = values[i + 1, j, p]
+                    values[i + 1, j, p] = ZERO if value < 0 else value
+    return values[last + 1]
+
+
+@vectorised
+def _geometry(geometry, points, number, cells, values):
+    """Densities, then features, at points of shape (3, BLOCK), of which it makes positions in the grid."""
+    inside = np.empty(BLOCK, np.float32)
+    for p in range(number):
+        x, y, z = points[0, p], points[1, p], points[2, p]
+        if geometry.contraction:
+            distance = max(abs(x), abs(y), abs(z))
+            scale = ONE if distance < 1 else (TWO - ONE / distance) / distance
+            x, y, z = HALF + QUARTER * scale * x, HALF + QUARTER * scale * y, HALF + QUARTER * scale * z
+            inside[p] = ONE
+        else:
+            x = (x - geometry.low[0]) / geometry.size[0]
+            y = (y - geometry.low[1]) / geometry.size[1]
+            z = (z - geometry.low[2]) / geometry.size[2]
+            inside[p] = ONE if min(x, y, z) > 0 and max(x, y, z) < 1 else ZERO
+        points[0, p] = min(max(x, ZERO), ONE)
+        points[1, p] = min(max(y, ZERO), ONE)
+        points[2, p] = min(max(z, ZERO), ONE)
+    for level in range(len(geometry.levels)):
+        find_cells(points, 0, number, geometry.scalings[level], cells)
+        interpolate(cells, number, geometry.levels[level], values[0, 2 * level : 2 * level + 2], 0)
+    outputs = _network(geometry.network, number, values)
+    for p in range(number):
+        outputs[0, p] = geometry.init_density * np.exp(min(outputs[0, p], HIGHEST)) * inside[p]
+    return outputs
+
+
+@vectorised
+def _distance(share, near, far, is_piecewise):
+    """Of a place on a ray: even between near and far end, or, as in mip-NeRF 360, up to 1 and then in its inverse."""
+    if not is_piecewise:
+        return near + share * (far - near)
+    low = HALF * near if near < ONE else ONE - HALF / near
+    high = HALF * far if far < ONE else ONE - HALF / far
+    place = low + share * (high - low)
+    return TWO * place if place < HALF else HALF / (ONE - place)
+
+
+@vectorised
+def _resample(weights, edges):
+    """Edges, as shares of a ray, of stretches that hold as much of the weights each; these are of even stretches."""
+    number, stretches = len(weights), len(edges) - 1
+    total = ZERO
+    for s in range(number):
+        total += weights[s] + PADDING
+    below, above, stretch = ZERO, (weights[0] + PADDING) / total, 0
+    for k in range(stretches + 1):
+        height = (np.float32(k) + HALF) / np.float32(stretches + 1)
+        while above <= height and stretch < number - 1:
+            stretch += 1
+            below, above = above, above + (weights[stretch] + PADDING) / total
+        share = min(max((height - below) / (above - below), ZERO), ONE)
+        edges[k] = (np.float32(stretch) + share) / np.float32(number)
+
+
+@vectorised
+def _brightness(output, activation):
+    """As `enerf_ns.enerf_field.brightness_of`."""
+    if activation == 2:
+        return np.exp(HALF * LOG_DARKEST + min(-QUARTER * LOG_DARKEST * output, HIGHEST))
+    share = ONE / (ONE + np.exp(-output))
+    return share if activation == 0 else np.exp(LOG_DARKEST * (ONE - share))
+
+
+@vectorised
+def _render(rays, first, last, proposal, num_proposal_samples, field, colour, activation, faint, num_samples, pictures):
+    """Rays from the first to before the last. Proposal is None where samples lie evenly along a ray."""
+    origins, directions, nears, fars, encoded = rays
+    is_piecewise = field.contraction
+    rgb, accumulation, depth = pictures
+    cells, points = new_cells(), np.empty((3, BLOCK), np.float32)
+    field_values, colour_values = _room(field.network), _room(colour)
+    num_features = field.network.weights[-1].shape[0] - 1
+    thin = faint / np.float32(num_samples)
+    edges = np.empty((RAYS, num_samples + 1), np.float32)
+    densities = np.empty(RAYS * ROUND, np.float32)
+    features = np.empty((num_features, RAYS * ROUND), np.float32)
+    weights, seen = np.empty(RAYS * ROUND, np.float32), np.empty(RAYS * ROUND, np.int64)
+    transmittance, lit = np.empty(RAYS, np.float32), np.empty(RAYS, np.int64)
+    for start in range(first, last, RAYS):
+        num_rays = min(RAYS, last - start)
+
+        for r in range(num_rays):
+            for s in range(num_samples + 1):
+                edges[r, s] = np.float32(s) / np.float32(num_samples)
+        if proposal is not None:
+            values = _room(proposal.network)
+            found = np.empty((RAYS, num_proposal_samples), np.float32)
+            parts = np.float32(num_proposal_samples)
+            total = num_rays * num_proposal_samples
+            for block in range(0, total, BLOCK):
+                number = min(BLOCK, total - block)
+                for p in range(number):
+                    r, s = start + (block + p) // num_proposal_samples, (block + p) % num_proposal_samples
+                    near, far = nears[r], fars[r]
+                    begin = _distance(np.float32(s) / parts, near, far, is_piecewise)
+                    end = _distance(np.float32(s + 1) / parts, near, far, is_piecewise)
+                    for axis in range(3):
+                        points[axis, p] = origins[r, axis] + directions[r, axis] * HALF * (begin + end)
+                outputs = _geometry(proposal, points, number, cells, values)
+                for p in range(number):
+                    found[(block + p) // num_proposal_samples, (block + p) % num_proposal_samples] = outputs[0, p]
+            for r in range(num_rays):
+                near, far = nears[start + r], fars[start + r]
+                light = ONE
+                for s in range(num_proposal_samples):
+                    begin = _distance(np.float32(s) / parts, near, far, is_piecewise)
+                    end = _distance(np.float32(s + 1) / parts, near, far, is_piecewise)
+                    passed = np.exp(-found[r, s] * (end - begin))
+                    found[r, s] = light * (ONE - passed)
+                    light *= passed
+                _resample(found[r], edges[r])
+        for r in range(num_rays):
+            for s in range(num_samples + 1):
+                edges[r, s] = _distance(edges[r, s], nears[start + r], fars[start + r], is_piecewise)
+
+        num_lit = num_rays
+        for r in range(num_rays):
+            lit[r], transmittance[r] = r, ONE
+            depth[start + r, 0] = HALF * (edges[r, num_samples - 1] + edges[r, num_samples])
+        for begin in range(0, num_samples, ROUND):
+            samples = min(ROUND, num_samples - begin)
+            total = num_lit * samples
+            for block in range(0, total, BLOCK):
+                number = min(BLOCK, total - block)
+                for p in range(number):
+                    r, s = lit[(block + p) // samples], begin + (block + p) % samples
+                    for axis in range(3):
+                        middle = HALF * (edges[r, s] + edges[r, s + 1])
+                        points[axis, p] = origins[start + r, axis] + directions[start + r, axis] * middle
+                outputs = _geometry(field, points, number, cells, field_values)
+                densities[block : block + number] = outputs[0, :number]
+                for k in range(num_features):
+                    features[k, block : block + number] = outputs[1 + k, :number]
+
+            num_seen, still_lit = 0, 0
+            for i in range(num_lit):
+                r = lit[i]
+                light = transmittance[r]
+                for s in range(samples):
+                    p = i * samples + s
+                    near, far = edges[r, begin + s], edges[r, begin + s + 1]
+                    passed = np.exp(-densities[p] * (far - near))
+                    weights[p] = light * (ONE - passed)
+                    before = accumulation[start + r, 0]
+                    accumulation[start + r, 0] += weights[p]
+                    if before < HALF and accumulation[start + r, 0] >= HALF:
+                        depth[start + r, 0] = HALF * (near + far)
+                    light *= passed
+                    if not weights[p] <= thin:  # also what is no number
+                        seen[num_seen] = p
+                        num_seen += 1
+                transmittance[r] = light
+
+            for block in range(0, num_seen, BLOCK):
+                number = min(BLOCK, num_seen - block)
+                for p in range(number):
+                    r = start + lit[seen[block + p] // samples]
+                    for k in range(encoded.shape[1]):
+                        colour_values[0, k, p] = encoded[r, k]
+                    for k in range(num_features):
+                        colour_values[0, encoded.shape[1] + k, p] = features[k, seen[block + p]]
+                outputs = _network(colour, number, colour_values)
+                for p in range(number):
+                    r = start + lit[seen[block + p] // samples]
+                    for channel in range(rgb.shape[1]):
+                        rgb[r, channel] += weights[seen[block + p]] * _brightness(outputs[channel, p], activation)
+
+            for i in range(num_lit):
+                if not transmittance[lit[i]] <= faint:
+                    lit[still_lit] = lit[i]
+                    still_lit += 1
+            num_lit = still_lit
+
+
+def _layers(network: MLP) -> Layers:
+    layers = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
+    return Layers(
+        tuple(layer.weight.detach().numpy() for layer in layers),
+        tuple(layer.bias.detach().numpy() for layer in layers),
+    )
+
+
+def _made_of(density: HashDensity) -> Geometry:
+    scalings, low = density.grid.scalings.numpy(), density.aabb[0].numpy()
+    levels = density.grid.table.detach().numpy().reshape(len(scalings), -1, 2)
+    size, init_density = density.aabb[1].numpy() - low, np.float32(density.init_density)
+    return Geometry(
+        levels, scalings, _layers(density.network), init_density, low, size, density.contraction is not None
+    )
+
+
+def render(
+    rays: RayBundle,
+    field: EnerfField,
+    sampler: PairedSpacedSampler | PairedProposalSampler,
+    proposal: HashDensity | None,
+    faint: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What rays show, without gradients.
+
+    Args:
+        rays: On the CPU, shape (rays), with nears and fars.
+        field: In float32, with two features per level.
+        sampler: How many samples there are along a ray. They are even where there is no proposal network; with
+            contraction, up to a distance of 1, and in its inverse from there on.
+        proposal: Whose weights the samples share evenly, or None.
+        faint: Share of a ray's light that may be missed for what lies behind, and as much for what is thin.
+
+    Returns:
+        Brightness (rays, channels) before black, accumulation (rays, 1), and median depth along the ray (rays, 1).
+    """
+    assert rays.nears is not None and rays.fars is not None
+    directions, encoded = rays.directions, rays.directions[:, :0]
+    if field.direction_encoding is not None:
+        encoded = field.direction_encoding(get_normalized_directions(directions))
+    given = (rays.origins, directions, rays.nears[:, 0], rays.fars[:, 0], encoded)
+    inputs = tuple(tensor.detach().float().contiguous().numpy() for tensor in given)
+    rgb = torch.zeros(len(rays), field.num_channels)
+    accumulation, depth = torch.zeros(len(rays), 1), torch.zeros(len(rays), 1)
+    pictures = (rgb.numpy(), accumulation.numpy(), depth.numpy())
+    where, num_proposal_samples = None, 0
+    if proposal is not None and isinstance(sampler, PairedProposalSampler):
+        where, num_proposal_samples = _made_of(proposal), sampler.num_proposal_samples_per_ray[0]
+        num_samples = sampler.num_nerf_samples_per_ray
+    else:
+        num_samples = sampler.num_samples
+    what, colour = _made_of(field.geometry), _layers(field.colour_network)
+    activation = ACTIVATIONS.index(field.brightness)
+
+    def task(index: int) -> None:
+        first, last = TASK * index, min(TASK * (index + 1), len(rays))
+        _render(
+            inputs, first, last, where, num_proposal_samples, what, colour, activation, np.float32(faint), num_samples,
+            pictures,
+        )  # fmt: skip
+
+    on_threads(task, -(-len(rays) // TASK))
+    return rgb, accumulation.nan_to_num(), depth
