@@ -54,6 +54,7 @@ from enerf_ns.probe import view_direction_gain
 from enerf_ns.ranges import check_ranges
 from enerf_ns.tables import choices_table, recording_table
 from enerf_ns.terminal import clear_line, duration, say
+from enerf_ns.threads import SharedCores
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
@@ -234,6 +235,7 @@ class EnerfTrainer(Trainer):
         self._unsaved = ""  # why the last checkpoint could not be stored
         self._found_wrong: set[str] = set()
         self._handlers: dict[int, Any] = {}
+        self._cores = SharedCores() if config.machine.device_type == "cpu" else None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         super().setup(test_mode)
@@ -336,10 +338,15 @@ class EnerfTrainer(Trainer):
                 f"{config.method_name} --load-config {shlex.quote(str(self.base_dir / 'config.yml'))}."
             ) from error
         finally:
+            if self._cores:
+                self._cores.give_back()
             config.max_num_iterations = total
             self._restore_signals()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        told = self._cores.look() if self._cores else None
+        if told and is_main_process():
+            say(told)
         with self.error_against_time.step(step):
             results = super().train_iteration(step)
         self._metrics = results[2]
