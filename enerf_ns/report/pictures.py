@@ -35,6 +35,8 @@ POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event"
 KEY_POSES = 7
 """Number of held-out cameras that the video flies past."""
 VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
+VIDEO_PIXELS = 320 * 240
+"""Pixels of a frame of the video at most, so that it takes a minute on two cores; larger cameras are shown reduced."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def camera_path(cameras: Cameras) -> dict:
     """A smooth flight past some of the cameras, as the viewer saves it and `ns-render camera-path` reads it.
 
     Cubic through the places of `KEY_POSES` cameras, slerp between their directions, with sides of the picture even, as
-    video players want them.
+    video players want them, and `VIDEO_PIXELS` at most.
     """
     chosen = np.unique(np.linspace(0, len(cameras) - 1, KEY_POSES).round().astype(int))
     poses = cameras.camera_to_worlds[chosen].double().cpu().numpy()
@@ -170,8 +172,10 @@ def camera_path(cameras: Cameras) -> dict:
     matrices = np.concatenate(
         [flight.poses(torch.from_numpy(times)).numpy(), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(times), 1, 1))], axis=1
     )
-    height, width = (int(size[0]) // 2 * 2 for size in (cameras.height, cameras.width))
-    fov = math.degrees(2.0 * math.atan(0.5 * height / float(cameras.fy[0])))
+    full = int(cameras.height[0]), int(cameras.width[0])
+    scale = min(1.0, math.sqrt(VIDEO_PIXELS / (full[0] * full[1])))
+    height, width = (max(2, int(scale * size) // 2 * 2) for size in full)
+    fov = math.degrees(2.0 * math.atan(0.5 * height / (scale * float(cameras.fy[0]))))
     return {
         "camera_type": "perspective",
         "render_height": height,

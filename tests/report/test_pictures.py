@@ -112,6 +112,16 @@ def test_the_picture_of_the_flight_has_even_sides():
     assert flown["camera_path"][0]["aspect"] == 32 / 24
 
 
+def test_the_flight_of_a_large_camera_is_reduced_and_sees_as_much():
+    large = cameras(3)
+    large.rescale_output_resolution(40.0)
+    flown = camera_path(large)
+    width, height = flown["render_width"], flown["render_height"]
+    assert 0.97 * 320 * 240 < width * height <= 320 * 240
+    assert width / height == pytest.approx(33 / 25, rel=0.01) and width % 2 == height % 2 == 0
+    assert flown["camera_path"][0]["fov"] == pytest.approx(math.degrees(2 * math.atan(12.5 / 32)), rel=0.01)
+
+
 def test_one_held_out_camera_stands_still():
     flown = camera_path(cameras(1))["camera_path"]
     assert len(flown) == 100 and flown[0]["camera_to_world"] == pytest.approx(flown[-1]["camera_to_world"])
