@@ -130,11 +130,19 @@ class ErrorAgainstTime:
             self.seconds, self.costs = state["seconds"], state["costs"]
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
-        if self.share and self.pipeline.datamanager.eval_dataset.are_frames:
-            with self._evaluation():
-                picture = torch.zeros(64, 64, 3)  # of which scores load what they need, once
+        if not self.share:
+            return
+        with self._evaluation():  # loads and compiles what scores and pictures need, once
+            dataset = self.pipeline.datamanager.eval_dataset
+            if dataset.are_frames:
+                picture = torch.zeros(64, 64, 3)
                 ssim(picture, picture)
                 lpips(picture, picture)
+            self.pipeline.eval()
+            held_out_view(
+                self.pipeline, self._numbers[0], min(dataset.frames.camera.height, dataset.frames.camera.width)
+            )
+            self.pipeline.train()
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
