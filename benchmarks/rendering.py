@@ -3,7 +3,7 @@
 Takes turns between ways to render the first held-out camera of a run, and prints a Markdown table: rays a second (the
 best of the repetitions), and PSNR against every sample of every ray, which is what Nerfstudio's own parts compute.
 
-    python benchmarks/rendering.py outputs/demo/recording/enerf/TIME
+    python benchmarks/rendering.py outputs/demo/runs/recording/enerf/TIME
 """
 
 from __future__ import annotations
@@ -65,8 +65,10 @@ def main() -> None:
         for name, way in ways.items():
             times[name].append(seconds_of(way, pipeline.device))
     whole = shown["every sample, and normals"]
-    name = torch.cuda.get_device_name() if pipeline.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-    print(f"PyTorch {torch.__version__}, {name}, {len(whole)} rays, best of {REPETITIONS}\n")
+    device = (
+        torch.cuda.get_device_name() if pipeline.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    )
+    print(f"PyTorch {torch.__version__}, {device}, {len(whole)} rays, best of {REPETITIONS}\n")
     print("| | rays a second | ratio | dB to every sample |\n| --- | --- | --- | --- |")
     for name in ways:
         rate, slowest = (len(whole) / min(times[way]) for way in (name, "every sample, and normals"))

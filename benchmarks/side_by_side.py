@@ -21,6 +21,7 @@ import torch
 from enerf_ns.evaluation.runs import method_config, set_up
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.threads import SharedCores
 
 SETTLING, TIMED = 12.0, 15.0
 """Seconds of training that are left out, and that are timed."""
@@ -30,8 +31,7 @@ def steps_a_second(recording: Path, folder: Path, gives_way: bool) -> float:
     """Of a training on all cores."""
     config = method_config("enerf", recording, folder, {"evaluation_share": 0.0, "machine.device_type": "cpu"})
     trainer = set_up(config)
-    if not gives_way:
-        trainer._cores = None
+    trainer._cores = SharedCores() if gives_way else None
     trainer.pipeline.train()
     start, steps, first = time.perf_counter(), 0, 0.0
     while (now := time.perf_counter() - start) < SETTLING + TIMED:

@@ -235,7 +235,7 @@ class EnerfTrainer(Trainer):
         self._unsaved = ""  # why the last checkpoint could not be stored
         self._found_wrong: set[str] = set()
         self._handlers: dict[int, Any] = {}
-        self._cores = SharedCores() if config.machine.device_type == "cpu" else None
+        self._cores: SharedCores | None = None  # while it trains on them
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         super().setup(test_mode)
@@ -327,6 +327,7 @@ class EnerfTrainer(Trainer):
             return
         self._handle_signals()
         config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
+        self._cores = SharedCores() if config.machine.device_type == "cpu" else None
         try:
             if is_main_process():
                 self.error_against_time.begin(self._start_step, self._recorded)
@@ -340,6 +341,7 @@ class EnerfTrainer(Trainer):
         finally:
             if self._cores:
                 self._cores.give_back()
+                self._cores = None
             config.max_num_iterations = total
             self._restore_signals()
 

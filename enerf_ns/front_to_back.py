@@ -46,7 +46,8 @@ def front_to_back(
             densities, features = density(positions[ray, here])
             thickness = densities[..., 0] * deltas[ray, here]
             behind = thickness.cumsum(dim=-1)
-            weight = transmittance[ray, None] * torch.exp(thickness - behind) * (1.0 - torch.exp(-thickness))
+            before = torch.nn.functional.pad(behind[:, :-1], (1, 0))  # not behind - thickness, which cancels
+            weight = transmittance[ray, None] * torch.exp(-before) * (1.0 - torch.exp(-thickness))
             weights[ray, here] = weight
             transmittance[ray] = transmittance[ray] * torch.exp(-behind[:, -1])
             if see is not None:

@@ -214,7 +214,8 @@ def _render(rays, first, last, proposal, num_proposal_samples, field, colour, ac
                     begin = _distance(np.float32(s) / parts, near, far, is_piecewise)
                     end = _distance(np.float32(s + 1) / parts, near, far, is_piecewise)
                     passed = np.exp(-found[r, s] * (end - begin))
-                    found[r, s] = light * (ONE - passed)
+                    weight = light * (ONE - passed)
+                    found[r, s] = weight if weight >= 0 else ZERO  # also where it is no number
                     light *= passed
                 _resample(found[r], edges[r])
         for r in range(num_rays):

@@ -35,7 +35,13 @@ def new_cells():
 
 @compiled
 def find_cells(x, first, number, scaling, cells):
-    """The cells of some of the positions x of shape (3, positions)."""
+    """Writes the cells of so many of the positions x, shape (3, positions) in [0, 1], from the first one on.
+
+    Args:
+        x, first, number: The positions; `BLOCK` of them at most.
+        scaling: Lattice cells a unit length.
+        cells: As of `new_cells`.
+    """
     edges, ends, ways = cells
     # rows are of the low bits of a hash, so that 32 bits, which wrap around, do
     prime1, prime2 = np.uint32(2654435761), np.uint32(805459861)
@@ -70,7 +76,13 @@ def _corners(cells, p):
 
 @compiled
 def interpolate(cells, number, table, encoding, first):
-    """Writes the two features of a block's positions to the columns of encoding from the first one on."""
+    """Writes the two features of a block's positions to encoding.
+
+    Args:
+        cells, number: Of the positions, as of `find_cells`.
+        table: Rows of one level, shape (T, 2); T is a power of two.
+        encoding, first: Shape (2, positions), written from this column on.
+    """
     mask = np.uint32(len(table) - 1)
     for p in range(number):
         edges, (low, high), (v0, w0), _, _ = _corners(cells, p)
