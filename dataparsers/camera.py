@@ -209,6 +209,19 @@ class Camera:
             return cv2.fisheye.undistortImage(image, self.matrix, coefficients, Knew=matrix).reshape(image.shape)
         return cv2.undistort(image, self.matrix, coefficients, newCameraMatrix=matrix).reshape(image.shape)
 
+    def downscaled(self, factor: float) -> Camera:
+        """The pinhole camera whose pixels are as many times as wide and high, where this one is a pinhole camera.
+
+        Args:
+            factor: At least 1; of the right and the lower border is left out what fills no whole pixel.
+
+        Raises:
+            ValueError: No whole pixel is left; a sentence that can follow "FILE holds".
+        """
+        assert self.model == "pinhole"
+        cx, cy = ((centre + 0.5) / factor - 0.5 for centre in (self.cx, self.cy))
+        return Camera(int(self.width / factor), int(self.height / factor), self.fx / factor, self.fy / factor, cx, cy)
+
     @cached_property
     def _seen_by(self) -> Float32[np.ndarray, "height width 2"]:
         """For a lookup camera, the place in its image that each pixel of the undistorted image shows.

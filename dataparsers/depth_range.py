@@ -142,7 +142,7 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
     planes = np.concatenate([DISPARITIES, -DISPARITIES])
     for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
         ahead, behind = np.split(sweep, 2, axis=1)
-        depths.append(baseline * _focal(camera) / _clear_disparities(*ahead))
+        depths.append(baseline * grid_focal_length(camera) / _clear_disparities(*ahead))
         num_by_chance += len(_clear_disparities(*behind))
         num_at_infinity += _num_at_infinity(*sweep)
     return Parallax(np.concatenate(depths), num_by_chance, num_at_infinity, extent)
@@ -167,7 +167,7 @@ def measure_share_beyond(
         0 also where the camera moves too little to tell the farthest depth from infinity.
     """
     near, far = depth_range
-    path, focal = _path(events, trajectory), _focal(camera)
+    path, focal = _path(events, trajectory), grid_focal_length(camera)
     baseline = min(_extent(path[1]), FARTHEST_DISPARITY * far / focal)
     farthest = baseline * focal / far
     if farthest < SMALLEST_DISPARITY:
@@ -200,7 +200,7 @@ def _sweeps(
     baselines: Iterable[float],
     disparities: Float64[np.ndarray, " planes"],
 ) -> Iterator[tuple[float, Float64[np.ndarray, "2 planes tiles"]]]:
-    """Each baseline (metres) with what `_sweep` found of each of its reference views; none where nothing moves."""
+    """Each baseline (metres) with what `sweep_planes` found of each of its reference views; none if nothing moves."""
     if not _extent(path[1]):
         return
     directions, generator = camera.pixel_directions(), np.random.default_rng(0)
@@ -210,24 +210,24 @@ def _sweeps(
             chosen = _events_seen_within(baseline / 2, reference, events, *path)
             if len(chosen) > EVENTS_PER_SWEEP:
                 chosen = generator.choice(chosen, EVENTS_PER_SWEEP, replace=False)
-            rays, centres = _in_view(
+            rays, centres = rays_in_view(
                 directions[events.y[chosen], events.x[chosen]],
                 trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
                 trajectory.poses(torch.as_tensor(reference)).numpy(),
             )
-            yield baseline, _sweep(rays, centres / baseline, camera, disparities)
+            yield baseline, sweep_planes(rays, centres / baseline, camera, disparities)
 
 
 def _extent(path: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
 
 
-def _focal(camera: Camera) -> float:
+def grid_focal_length(camera: Camera) -> float:
     """Focal length in grid pixels."""
-    return camera.fx * _grid_scale(camera)
+    return camera.fx * grid_scale(camera)
 
 
-def _grid_scale(camera: Camera) -> float:
+def grid_scale(camera: Camera) -> float:
     """Grid pixels a pixel; a grid finer than the sensor would show the sensor's own pixels as a pattern."""
     return min(GRID_WIDTH / camera.width, 1.0)
 
@@ -242,7 +242,7 @@ def _events_seen_within(radius: float, reference: int, events: Events, path_time
     return np.arange(first, last)
 
 
-def _in_view(
+def rays_in_view(
     directions: Float64[np.ndarray, "rays 3"],
     poses: Float64[np.ndarray, "rays 3 4"],
     view: Float64[np.ndarray, "3 4"],
@@ -254,7 +254,7 @@ def _in_view(
     return rays[ahead] / rays[ahead, 2:], centres[ahead]
 
 
-def _sweep(
+def sweep_planes(
     rays: Float64[np.ndarray, "rays 3"],
     centres: Float64[np.ndarray, "rays 3"],
     camera: Camera,
@@ -264,31 +264,37 @@ def _sweep(
 
     A ray a (z = 1) from c meets the plane of depth z at c + (z - c_z) a, which the view sees at a + (c - c_z a) / z.
     """
-    scale, focal = _grid_scale(camera), _focal(camera)
+    scale, focal = grid_scale(camera), grid_focal_length(camera)
     columns, rows = (round(side * scale) // TILE for side in (camera.width, camera.height))
     start = focal * rays[:, :2] + np.array([camera.cx, camera.cy]) * scale
     drift = centres[:, :2] - centres[:, 2:] * rays[:, :2]
     votes, squares = np.zeros((2, len(disparities), rows * columns))
-    approach = np.ascontiguousarray(centres[:, 2]) / focal
-    compiled(_vote)(start, drift, approach, disparities, np.empty((rows * columns, TILE**2)), columns, votes, squares)
+    approach, counts = np.ascontiguousarray(centres[:, 2]) / focal, np.empty((rows * TILE, columns * TILE))
+    compiled(_vote)(start, drift, approach, disparities, counts, votes, squares)
     votes, squares = votes / TILE**2, squares / TILE**2
     return np.stack([(squares - votes**2) / np.maximum(votes, 1e-9), votes])
 
 
-def _vote(start, drift, approach, disparities, counts, columns, votes, squares):
+def _vote(start, drift, approach, disparities, counts, votes, squares):
     """Adds up, for each plane and tile, the votes of all rays and the squares of the counts of its grid pixels."""
+    height, width = counts.shape
     for plane, disparity in enumerate(disparities):
         counts[:] = 0.0
         for ray in range(len(start)):
-            x = int(np.rint(start[ray, 0] + disparity * drift[ray, 0]))
-            y = int(np.rint(start[ray, 1] + disparity * drift[ray, 1]))
-            tile = y // TILE * columns + x // TILE
-            if 0 <= x < columns * TILE and 0 <= y and tile < len(counts):
-                pixel = y % TILE * TILE + x % TILE
-                area = (1 - disparity * approach[ray]) ** 2  # so that magnification does not look like focus
-                votes[plane, tile] += area
-                squares[plane, tile] += area * (area + 2 * counts[tile, pixel])
-                counts[tile, pixel] += area
+            x = start[ray, 0] + disparity * drift[ray, 0] + 0.5
+            y = start[ray, 1] + disparity * drift[ray, 1] + 0.5
+            if 0.0 <= x < width and 0.0 <= y < height:  # magnification shall not look like focus
+                counts[int(y), int(x)] += (1.0 - disparity * approach[ray]) ** 2
+        for row in range(height):
+            for column in range(width // TILE):
+                vote, square = 0.0, 0.0
+                for x in range(column * TILE, (column + 1) * TILE):
+                    count = counts[row, x]
+                    vote += count
+                    square += count * count
+                tile = row // TILE * (width // TILE) + column
+                votes[plane, tile] += vote
+                squares[plane, tile] += square
 
 
 def _clear_disparities(

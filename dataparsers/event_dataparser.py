@@ -6,7 +6,10 @@ trainer, models or methods.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
@@ -21,10 +24,17 @@ from tyro.conf import Suppress
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence
+from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
+from enerf_ns.dataparsers.picture_files import write_pictures
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.dataparsers.scene_box import scene_normalisation
+
+with warnings.catch_warnings(), suppress(ImportError):  # of which Nerfstudio would show two at each start
+    warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.custom_", FutureWarning)
+    import_module("nerfstudio.field_components.activations")
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
@@ -46,8 +56,9 @@ class EventDataParserConfig(DataParserConfig):
     held_out_every: Optional[int] = None  # noqa: UP045
     """Every so many frames one is kept from training, for evaluation. 1: all, for learning from events alone. None: 4,
     unless a preset selects frames."""
-    train_frames: Literal["blurred", "sharp"] = "blurred"
-    """Which frames to train on, where the recording has both; evaluation is always on sharp ones."""
+    train_frames: Optional[Literal["blurred", "sharp"]] = None  # noqa: UP045
+    """Which frames to train on, where the recording has both; evaluation is always on sharp ones. None: blurred ones
+    for the methods of enerf-ns; for all others sharp ones, or those that were reconstructed from events."""
     exposure_ms: Optional[float] = None  # noqa: UP045
     """How long the frames to train on were exposed, half of it before and half after their stamps; 0 for an instant.
     None: the recording's own."""
@@ -61,6 +72,8 @@ class EventDataParserConfig(DataParserConfig):
     """Use pixels that fire far more often than their neighbourhood."""
     keep_pose_gaps: bool = False
     """Use what lies in gaps between poses, which are guesses there."""
+    downscale_factor: Optional[float] = None  # noqa: UP045
+    """How many times smaller than the frames their pictures are; events stay as they are. None: 1."""
     undistort: bool = True
     """Undo the distortion of the lenses that the calibration states. False: as if there were none."""
     train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
@@ -69,13 +82,15 @@ class EventDataParserConfig(DataParserConfig):
     """Numbers of the frames kept for evaluation, from 0. None: by held-out-every."""
     format: Suppress[str] = "auto"
     """Name of a registered format, or auto to find out; what a sub-command stands for."""
+    picture_files: Suppress[bool] = True
+    """Write pictures that any method reads; the methods of enerf-ns read what a recording has, frames or events."""
     options: Annotated[FormatOptions, tyro.conf.arg(name="")] = FormatOptions()  # noqa: RUF009 - frozen
     """Options of the format. A default and no default_factory, so that runs of before there were any can be loaded."""
 
 
 @dataclass
 class EventDataParser(DataParser):
-    """Turns a recording into cameras in a box of size 2 around the origin, z up."""
+    """Turns a recording into cameras in a box of size 2 around the origin, z up, and pictures that any method reads."""
 
     config: EventDataParserConfig
 
@@ -87,11 +102,22 @@ class EventDataParser(DataParser):
         return read_recording(config.data, config.format, *selection, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        make_ffmpeg_available()
+        allow_numpy_scalars_in_checkpoints()
         with exit_with_a_sentence():
-            return self.outputs(self.recording(), split)
+            recording = self.recording()
+            if not self.config.picture_files:
+                return self.outputs(recording, split)
+            if not recording.has_frames:
+                raise RecordingError(
+                    f"{recording.path} holds no frames to train on, from which this method learns; learn from its "
+                    f"events with ns-train enerf --data {recording.path}, or make frames of them with enerf "
+                    f"reconstruct {recording.path} --output-dir NEW and give that folder."
+                )
+            return with_picture_files(self.outputs(recording, split))
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
-        """Cameras of one split, and the box, as Nerfstudio wants them.
+        """Cameras of one split, and the box, as Nerfstudio wants them; the file names are those of the recording.
 
         The metadata hold the recording; the frames, and whether they are some, as of `split_frames`; and transform,
         the float64 original of `dataparser_transform`, since float32 is 0.25 m coarse 5e6 m from the world's origin.
@@ -103,6 +129,7 @@ class EventDataParser(DataParser):
         Raises:
             RecordingError: The depth of the scene is neither known nor observable, or all frames lie in gaps of the
                 poses.
+            FlagError: The frames cannot be downscaled so far.
         """
         near, far = scene_depth_range(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
@@ -113,7 +140,7 @@ class EventDataParser(DataParser):
         camera_to_scene[..., 3] = scale * (camera_to_scene[..., 3] + transform[:, 3])
         camera_to_scene[..., :3] = camera_to_scene[..., :3] @ OPENGL_FROM_OPENCV
 
-        camera = frames.camera.undistorted()
+        camera = frames.picture_camera
         cameras = Cameras(
             camera_to_worlds=torch.from_numpy(camera_to_scene).float(),
             fx=camera.fx,
@@ -140,8 +167,29 @@ class EventDataParser(DataParser):
         )
 
 
+def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:
+    """What methods that know nothing of recordings can read: pictures, and depth, in files that fit the cameras.
+
+    The pictures are written to the cache, undistorted and downscaled as the cameras state, with 8 bits and without
+    transparency, since each of Nerfstudio's data sets opens files by itself: neither all of them undistort, nor is
+    every lens one that Nerfstudio's cameras can state, and some write beside the pictures, which must not be the
+    recording.
+
+    Raises:
+        RecordingError: A file cannot be read.
+        OutputError: The pictures cannot be written.
+    """
+    frames = outputs.metadata["frames"]
+    metadata = {"transform": outputs.metadata["transform"]}
+    if frames.depth_filenames is not None and frames.camera.model == "pinhole":
+        metadata |= {"depth_filenames": list(frames.depth_filenames), "depth_unit_scale_factor": 1.0}
+    return replace(outputs, image_filenames=write_pictures(frames), metadata=metadata)
+
+
 def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
     """The frames of one split; where the recording has none, instants along its trajectory to picture events at.
+
+    Which frames are held out does not depend on those to train on, so that all methods are scored on the same.
 
     Returns:
         The frames, without those in gaps of the poses, nor, to train on, those whose exposures reach beyond the poses
@@ -149,12 +197,25 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
 
     Raises:
         RecordingError: None is left.
-        FlagError: The exposure that is set is none that the frames can have.
+        FlagError: The exposure, or the downscaling, that is set is none that the frames can have.
     """
+    frames, are_frames = _split_frames(recording, config, held_out)
+    if config.downscale_factor is None:
+        return frames, are_frames
+    try:
+        frames = replace(frames, downscale_factor=config.downscale_factor)
+        _ = frames.picture_camera
+    except ValueError as error:
+        raise FlagError(f"event-data --downscale-factor {config.downscale_factor:g} gives {error}") from error
+    return frames, are_frames
+
+
+def _split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
     if held_out and recording.held_out_frames:
         return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
-    if not held_out and config.train_frames == "blurred" and recording.blurred_frames:
+    train_frames = config.train_frames or ("blurred" if recording.reconstructed_by else "sharp")
+    if not held_out and train_frames == "blurred" and recording.blurred_frames:
         frames = recording.blurred_frames
     if not held_out and config.exposure_ms is not None and recording.has_frames:
         try:

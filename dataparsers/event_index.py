@@ -16,6 +16,8 @@ from enerf_ns.dataparsers.recording import Events
 
 EVENTS_IN_PICTURE = 0.2
 """Events drawn into one picture, as a share of the sensor's pixels."""
+EVENTS_AT_ONCE = 2**22
+"""Events whose times are looked at together."""
 ON_COLOUR, OFF_COLOUR, NO_EVENT = (205, 50, 50), (50, 70, 205), (255, 255, 255)
 """Colours of a picture where it became brighter, where darker, and where nothing fired; red, green, blue."""
 
@@ -108,7 +110,19 @@ class EventIndex:
             at_most: Of more events than this, every second, third ... of each pixel is taken.
         """
         step = 1 if at_most is None else max(-(-len(self) // at_most), 1)
-        chosen = torch.arange(0, len(self), step, device=self.times.device)
+        return self._in_time_order(torch.arange(0, len(self), step, device=self.times.device))
+
+    def events_within(self, spans: Int64[np.ndarray, "spans 2"]) -> Events:
+        """The events at and between the ends (ns) of some spans of time, which may overlap; in order as `events`."""
+        begins, ends = (torch.from_numpy(side.copy()).sort().values for side in (spans[:, 0], spans[:, 1]))
+        chosen = []
+        for first in range(0, len(self), EVENTS_AT_ONCE):
+            times = self.times[first : first + EVENTS_AT_ONCE]
+            open_spans = torch.searchsorted(begins, times, right=True) - torch.searchsorted(ends, times)
+            chosen.append(first + torch.nonzero(open_spans)[:, 0])
+        return self._in_time_order(torch.cat(chosen))
+
+    def _in_time_order(self, chosen: Int64[Tensor, " chosen"]) -> Events:
         pixels = torch.searchsorted(self.offsets, chosen, right=True) - 1
         before = torch.where(chosen > 0, self.positives[chosen - 1], 0)
         order = torch.argsort(self.times[chosen], stable=True)

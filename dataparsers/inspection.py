@@ -18,11 +18,14 @@ from rich.markup import escape
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.agreement import HARMFUL_SHIFT, MILLISECOND, SHOWN_DELAYS, Agreement, shown_hypotheses
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import UserError
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.files import fill_page, load_image
+from enerf_ns.dataparsers.focus import AS_READ, AS_STATED, Hypothesis
+from enerf_ns.dataparsers.frame_bursts import FrameBursts
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import (
     EventStatistics,
@@ -34,6 +37,7 @@ from enerf_ns.dataparsers.problems import (
 )
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.scene_box import scene_normalisation
+from enerf_ns.dataparsers.sensor_survey import SensorSurvey
 from enerf_ns.dataparsers.trajectory import evenly_spaced
 
 if TYPE_CHECKING:
@@ -41,12 +45,21 @@ if TYPE_CHECKING:
 
 NUM_INSTANTS = 6
 """Number of instants at which events are shown, beside the frames of the same times."""
+NUM_OVERLAYS = 4
+"""Number of frames that edges of events are drawn on."""
+NUM_WARPED = 3
+"""Number of instants that events are warped to: of slow, of usual and of fast motion."""
+BRIGHTEST = 99.5
+"""Percentile of the counts of warped events that is drawn black."""
 NUM_FRUSTA = 16
 """Number of cameras drawn along the trajectory."""
 PICTURE_WIDTH = 640
 """Most pixels across a picture on the page."""
 NAMED_HOT_PIXELS = 8
 """Number of hot pixels that are listed one by one; the heat map marks all."""
+
+ALL_DELAYS = (0, *(delay * MILLISECOND for delay in SHOWN_DELAYS))
+"""Delays (ns) of the events that are laid over frames."""
 
 BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
 
@@ -64,6 +77,26 @@ class Instant:
 
 
 @dataclass(frozen=True)
+class Overlay:
+    """A frame and the events of different times to be laid over it; pictures as data URIs."""
+
+    time: str
+    frame: str
+    events: list[str]
+    """One for each of the delays that the page offers."""
+
+
+@dataclass(frozen=True)
+class Warped:
+    """Events of a short time, warped to one instant by one hypothesis."""
+
+    words: str
+    """The hypothesis, and how sharp it makes them."""
+    picture: str
+    """As a data URI."""
+
+
+@dataclass(frozen=True)
 class Inspection:
     """A recording with all that was found out about it."""
 
@@ -72,13 +105,17 @@ class Inspection:
     depth_range: tuple[float, float] | None
     """Nearest and farthest depth of the scene, metres; None where it is neither stated nor can be measured."""
     problems: list[Problem]
+    sensor: SensorSurvey
+    """What events and frames say about the sensor."""
+    agreement: Agreement | None = None
+    """What the events say about clocks, poses and focal length; None where they are too few to say anything."""
 
     @classmethod
     def of(cls, recording: EventRecording) -> Inspection:
-        """Counts events, looks for problems and measures the depth of the scene.
+        """Counts events, looks for problems, measures sensor and depth, compares events with poses and frames.
 
         Raises:
-            RecordingError: The events cannot be used.
+            RecordingError: The events or a frame cannot be used.
         """
         statistics = event_statistics(recording)
         near_far, unknown = None, []
@@ -86,11 +123,14 @@ class Inspection:
             near_far = scene_depth_range(recording)
         except UserError as error:
             unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
-        return cls(recording, statistics, near_far, find_problems(recording, near_far) + unknown)
+        agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
+        problems = [*(agreement.problems() if agreement else []), *sensor.problems()]
+        problems += [*find_problems(recording, near_far), *unknown]
+        return cls(recording, statistics, near_far, problems, sensor, agreement)
 
     def print_tables(self, console: Console) -> None:
         """What was found, numbers, and problems in red, on the terminal."""
-        for title, rows in (("Recording", self.found()), ("Numbers", self.numbers())):
+        for title, rows in self._tables():
             table = Table(title=title, show_header=False, title_justify="left")
             for name, value in rows.items():
                 table.add_row(name, escape(value))
@@ -123,13 +163,6 @@ class Inspection:
         if frames is not None:
             rows["frame camera"] = "the same" if frames.camera == recording.camera else _camera(frames.camera)
             rows["extrinsics"] = _extrinsics(recording, frames)
-        rows["thresholds"] = (
-            "{:.3g} on, {:.3g} off".format(*recording.contrast_thresholds)
-            if recording.contrast_thresholds
-            else "not stated"
-        )
-        if recording.refractory_period:
-            rows["refractory"] = f"{recording.refractory_period * 1e-3:g} µs"
         rows["colours"] = recording.bayer_pattern or "none: a grey sensor"
         return rows
 
@@ -150,9 +183,6 @@ class Inspection:
             f"{100 * statistics.share_below_two:.1f} % of the pixels have fewer than two",
             "polarity": f"{100 * statistics.num_on / statistics.num_events:.1f} % on, "
             f"{100 * statistics.num_off / statistics.num_events:.1f} % off",
-            "implied ratio": f"C_on = {statistics.threshold_ratio:.3g} C_off, if it brightens as much as it darkens"
-            if statistics.num_on and statistics.num_off
-            else "unknown, without both polarities",
             "hot pixels": f"{len(hot):,} left out, (x, y) = {places}{more}" if len(hot) else "none left out",
             "pose coverage": f"{100 * (1 - missing):.3g} % of the events' time"
             + (f", {len(gaps)} gap{'s' * (len(gaps) > 1)}" if len(gaps) else ", no gaps"),
@@ -171,6 +201,19 @@ class Inspection:
             rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
         return rows
 
+    def focus(self) -> dict[str, str]:
+        """What events say about clocks, poses and focal length, by name; empty where they are too few."""
+        return self.agreement.rows() if self.agreement else {}
+
+    def _tables(self) -> list[tuple[str, dict[str, str]]]:
+        tables = [
+            ("Recording", self.found()),
+            ("Numbers", self.numbers()),
+            ("Sensor", self.sensor.rows()),
+            ("Focus", self.focus()),
+        ]
+        return [(title, rows) for title, rows in tables if rows]
+
     def page(self) -> str:
         """One HTML file with all pictures in it, which loads nothing."""
         return fill_page(
@@ -182,6 +225,13 @@ class Inspection:
                 ("What was found", self.found(), self.notes()),
                 ("In numbers", self.numbers(), []),
             ],
+            sensor=self.sensor.rows(),
+            bursts=_plot(self.bursts(self.sensor.bursts)) if self.sensor.bursts else None,
+            focus=self.focus(),
+            delays=self._delays(),
+            flick=self._flick(),
+            overlays=self._overlays(),
+            warped=self._warped(),
             has_frames=self._frames is not None,
             timeline=_plot(self.timeline()),
             instants=self._instants(),
@@ -223,6 +273,24 @@ class Inspection:
         rate.set_ylim(0, 1.1 * statistics.rate[calm].max() / 1e6)
         rate.set_xlim(min(edges[0], poses.start * 1e-9), max(edges[-1], poses.end * 1e-9))
         rate.spines[["top", "right"]].set_visible(False)
+        return figure
+
+    def bursts(self, bursts: FrameBursts) -> Figure:
+        """The event rate around the stamps of frames, with bursts in red."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(11.4, 2.6), layout="constrained", dpi=150)
+        axis = figure.subplots()
+        edges = bursts.edges * 1e-6
+        axis.stairs(bursts.ratio, edges, fill=True, color=BLUE, alpha=0.35)
+        axis.stairs(bursts.ratio, edges, color=BLUE, linewidth=0.8, baseline=None)
+        for begin, end in bursts.delays * 1e-6:
+            axis.axvspan(begin, end, color=RED, alpha=0.35)
+        axis.set_xlim(edges[0], edges[-1])
+        axis.set_ylim(0, None)
+        axis.set_xlabel("milliseconds from the stamp of a frame")
+        axis.set_ylabel("times the usual rate")
+        axis.spines[["top", "right"]].set_visible(False)
         return figure
 
     def trajectory(self) -> Figure:
@@ -309,6 +377,69 @@ class Inspection:
             for i in chosen
         ]
 
+    def _delays(self) -> list[str]:
+        """Delays of the events that are laid over frames, in words: those of `_delays_ns`."""
+        return [
+            "as stamped" if not delay else f"{delay / MILLISECOND:+.3g} ms" + " (best)" * (delay not in ALL_DELAYS)
+            for delay in self._delays_ns()
+        ]
+
+    def _delays_ns(self) -> list[int]:
+        """As stamped, wrong ones, and the best, if that is another."""
+        best = self.agreement.frame_delay if self.agreement else None
+        found = round(-best.value) * MILLISECOND if best and best.is_told else 0
+        return [0, *(delay for delay in ALL_DELAYS if delay), *([found] if found not in ALL_DELAYS else [])]
+
+    def _flick(self) -> int:
+        """Number of the delay that the page flicks to: the best if what is stated is wrong, else the last wrong one."""
+        delays = self._delays_ns()
+        is_wrong = self.agreement and self.agreement.pixels(delays[-1] / MILLISECOND) > HARMFUL_SHIFT
+        return len(delays) - 1 if is_wrong else len(SHOWN_DELAYS)
+
+    def _overlays(self) -> list[Overlay]:
+        if self.agreement is None or self.agreement.edges is None:
+            return []
+        edges, plane = self.agreement.edges, self.agreement.plane
+        chosen = np.unique(np.linspace(0, len(edges.frames.times) - 1, NUM_OVERLAYS + 2)[1:-1].round().astype(int))
+        return [
+            Overlay(
+                _seconds(edges.frames.times[i]),
+                _picture(edges.picture(i), "JPEG"),
+                [
+                    _picture(edges.events_at(int(edges.frames.times[i]) + delay, plane), "PNG")
+                    for delay in self._delays_ns()
+                ],
+            )
+            for i in chosen.tolist()
+        ]
+
+    def _warped(self) -> list[tuple[str, list[Warped]]]:
+        """For some instants, their time and speed in words, and pictures of events warped to them."""
+        if self.agreement is None:
+            return []
+        focus, readings = self.agreement.focus, self.agreement.readings
+        delay = round(self.agreement.pose_delay.value) * MILLISECOND if self.agreement.pose_delay.is_told else 0
+        best = Hypothesis(delay, 1.0, AS_READ if AS_READ in readings else readings[0])
+        hypotheses = [AS_STATED, *(shown for shown in shown_hypotheses() if focus.allows(shown.focal_scale))]
+        hypotheses += [best] if best not in hypotheses else []
+        by_speed = sorted(focus.windows, key=lambda window: window.speed)
+        shown = []
+        for i in np.unique(np.linspace(0, len(by_speed) - 1, NUM_WARPED).round().astype(int)):
+            window = by_speed[i]
+            pictures = [focus.picture(window, hypothesis) for hypothesis in hypotheses]
+            black = float(np.percentile(pictures[0][0], BRIGHTEST)) or 1.0
+            unwarped, _ = focus.picture(window, None)
+            row = [Warped("where they fired", _density(unwarped, black))]
+            for hypothesis, (picture, sharpness) in zip(hypotheses, pictures, strict=True):
+                words = hypothesis.words + (" (best)" if hypothesis is best else "")
+                row.append(Warped(f"{words}: {100 * sharpness / pictures[0][1]:.0f} %", _density(picture, black)))
+            title = (
+                f"{_seconds(window.instant)}, {1e-6 * (window.end - window.start):.0f} ms of events, the picture moves "
+                f"at {window.speed:.0f} pixels/s"
+            )
+            shown.append((title, row))
+        return shown
+
     def _events_at(self, time: int) -> str:
         return _picture(event_picture(index_events(self.recording), self.recording.camera, int(time)), "PNG")
 
@@ -382,6 +513,11 @@ def _picture(pixels: UInt8[np.ndarray, "height width channels"], format: Literal
     buffer = io.BytesIO()
     image.save(buffer, format=format)
     return _data_uri(buffer, format.lower())
+
+
+def _density(counts: Float64[np.ndarray, "rows columns"], black: float) -> str:
+    """Counts as a picture, dark where there are many."""
+    return _picture((255 * (1 - np.sqrt(np.minimum(counts / black, 1))))[..., None].astype(np.uint8), "PNG")
 
 
 def _data_uri(buffer: io.BytesIO, format: str) -> str:

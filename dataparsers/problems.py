@@ -137,11 +137,6 @@ class EventStatistics:
     def events_per_pixel(self) -> float:
         return self.num_events / self.counts.size
 
-    @property
-    def threshold_ratio(self) -> float:
-        """C_on / C_off under which the scene brightens as much as it darkens: off events per on event."""
-        return self.num_off / self.num_on if self.num_on else math.inf
-
 
 def event_statistics(recording: EventRecording, at_most: int | None = None) -> EventStatistics:
     """Counts the events of a recording.

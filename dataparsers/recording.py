@@ -11,10 +11,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int, Int64
+from jaxtyping import Bool, Float32, Int, Int64, UInt8
+from PIL import Image
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
@@ -86,6 +88,8 @@ class Frames:
     None where that is not known. A frame is the mean of what its camera saw meanwhile."""
     numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Number of each frame in its folder, from 0; counted here unless given."""
+    downscale_factor: float = 1.0
+    """Pixels along the squares of which each becomes one pixel of a picture, at least 1."""
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -99,6 +103,47 @@ class Frames:
         exposures = np.zeros_like(self.times) if self.exposures is None else self.exposures
         opens = self.times - exposures // 2
         return np.stack([opens, opens + exposures], axis=1)
+
+    @property
+    def picture_camera(self) -> Camera:
+        """The camera of the pictures: without distortion, downscaled."""
+        camera = self.camera.undistorted()
+        return camera if self.downscale_factor == 1.0 else camera.downscaled(self.downscale_factor)
+
+    def picture(self, index: int) -> UInt8[np.ndarray, "height width channels"]:
+        """A frame as the `picture_camera` would have taken it, with one or three channels.
+
+        Raises:
+            RecordingError: The file is missing or cannot be decoded.
+        """
+        return self.downscaled(self.camera.undistort(load_image(self.filenames[index])))
+
+    def downscaled(
+        self, image: UInt8[np.ndarray, "height width channels"]
+    ) -> UInt8[np.ndarray, "new_height new_width channels"]:
+        """An image of the size of the frames at that of the pictures, antialiased."""
+        if self.downscale_factor == 1.0:
+            return image
+        camera = self.picture_camera
+        right, lower = camera.width * self.downscale_factor, camera.height * self.downscale_factor
+        size, box = (camera.width, camera.height), (0.0, 0.0, right, lower)
+        shown = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image)
+        return np.asarray(shown.resize(size, Image.Resampling.HAMMING, box)).reshape(camera.height, camera.width, -1)
+
+    def depth(self, index: int) -> Float32[np.ndarray, "height width"] | None:
+        """Depth along the optical axis in metres, 0 where it is unknown; of the middles of downscaled pixels.
+
+        Raises:
+            RecordingError: The file is missing or holds no array.
+        """
+        if self.depth_filenames is None:
+            return None
+        depth = load_array(self.depth_filenames[index]).astype(np.float32)
+        camera = self.picture_camera
+        rows, columns = (
+            ((np.arange(side) + 0.5) * self.downscale_factor).astype(int) for side in (camera.height, camera.width)
+        )
+        return depth[np.ix_(rows, columns)]
 
     def with_exposure(self, exposure: int | None) -> Frames:
         """The frames, all exposed for as long (ns), or for an unknown time."""

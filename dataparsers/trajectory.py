@@ -54,6 +54,8 @@ class Trajectory:
         quaternions: Float64[np.ndarray, "poses 4"],
     ):
         self.times, self.positions, self.quaternions = times, positions, quaternions
+        self.body: tuple[Trajectory, Float64[np.ndarray, "4 4"]] | None = None
+        """What this camera is mounted on, and its pose there, if it is a trajectory `of_mounted`."""
         if not len(times) == len(positions) == len(quaternions):
             raise ValueError(
                 f"A trajectory needs one position and one quaternion for each time, but got {len(times)} times, "
@@ -86,9 +88,11 @@ class Trajectory:
             body_from_camera: Pose of the camera in the axes of the body, metres: the extrinsics.
         """
         bodies, mount = Rotation.from_quat(self.quaternions), Rotation.from_matrix(body_from_camera[:3, :3])
-        return Trajectory(
+        mounted = Trajectory(
             self.times, self.positions + bodies.apply(body_from_camera[:3, 3]), (bodies * mount).as_quat()
         )
+        mounted.body = self, body_from_camera
+        return mounted
 
     def covers(self, times: Int64[Tensor | np.ndarray, "*batch"]) -> Bool[Tensor | np.ndarray, "*batch"]:
         """Which times (ns) lie between the first and the last pose, both included."""

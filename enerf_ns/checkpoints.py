@@ -15,6 +15,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
@@ -121,18 +122,3 @@ def set_random_state(state: dict[str, Any], device: torch.device) -> None:
         torch.cuda.set_rng_state(state["cuda"], device)
     np.random.set_state(state["numpy"])  # noqa: NPY002 - libraries draw from it
     random.setstate(state["python"])
-
-
-def allow_numpy_scalars_in_checkpoints() -> None:
-    """Let torch 2.6 and later load the learning rates that Nerfstudio's scheduler stores as NumPy scalars."""
-    scalar: Any = np.float64(0).__reduce__()[0]
-    torch.serialization.add_safe_globals(
-        [
-            scalar,
-            (scalar, "numpy.core.multiarray.scalar"),
-            (scalar, "numpy._core.multiarray.scalar"),
-            np.dtype,
-            type(np.dtype(np.float64)),
-            type(np.dtype(np.float32)),
-        ]
-    )

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from operator import attrgetter
 from typing import Any, Protocol, TypeVar
 
@@ -22,14 +23,21 @@ from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.scene_box import scene_normalisation
+from enerf_ns.dataparsers.sensor_estimates import (
+    Estimate,
+    contrast_thresholds,
+    noise_per_event,
+    refractory_period,
+    threshold_spread,
+)
 from enerf_ns.enerf_datamanager import HELD_OUT_SPANS, EnerfDataManagerConfig
 from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
-from enerf_ns.enerf_model import EnerfModelConfig
+from enerf_ns.enerf_model import MEAN_BRIGHTNESS, EnerfModelConfig
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.paper_selections import preset_named, selections
 from enerf_ns.poses.motion import exposure_motion
 from enerf_ns.sensor.response import ColourFilter, response_named
-from enerf_ns.sensor.sensor_model import GREY, thresholds_from_polarity
+from enerf_ns.sensor.sensor_model import GREY
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
 
 DATAPARSER = "datamanager.dataparser"
@@ -49,6 +57,10 @@ class MethodDefaults:
     event_loss: str = "huber"
     no_event_loss_weight: float = 0.1
     no_event_margin: float = 0.0
+    level_loss_weight: float = 0.1
+    """Where the field learns from events alone."""
+    learns_sensor: bool = True
+    """Whether what the recording does not state of its sensor is measured and learned, instead of assumed."""
     whole_preset: bool = False
     """Whether presets bring their box and batch sizes, too, which are those of the paper's network."""
     settings: tuple[tuple[str, Any], ...] = ()
@@ -61,6 +73,15 @@ DEFAULT_WINDOW_MS = 60.0
 
 LONGEST_ACCUMULATION = 0.05
 """Longest window of accumulated events, as a share of the recording's time: EventNeRF's 50 of 1000 views."""
+
+LONGEST_DISTANCE = 10
+"""Most events that are chosen for a partner to lie ahead; at least 2."""
+
+MOST_NOISE = 0.1
+"""Variance, in squared thresholds, of what noise adds to the events of a pair that is as far apart as any."""
+
+RANGE_OF_NOISE = 2.9
+"""Range of the sums of a random walk that one in a hundred exceeds, in standard deviations at its end."""
 
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""
@@ -145,7 +166,11 @@ which share the part lowers the error of held-out pairs, and the standard error 
 
 
 def resolve(
-    config: PipelineConfig, recording: EventRecording, preset: str | None = None, probe: Probe | None = None
+    config: PipelineConfig,
+    recording: EventRecording,
+    preset: str | None = None,
+    probe: Probe | None = None,
+    batch_factor: Callable[[Any], int] = lambda config: 1,
 ) -> Resolution:
     """Decides all that a config leaves open. Nothing is changed; the same arguments give the same answer.
 
@@ -155,6 +180,8 @@ def resolve(
         preset: A sequence of the paper whose selections are used.
         probe: What letting brightness depend on the direction gains; asked where the camera goes around the scene.
             None: nothing.
+        batch_factor: How many times the rays of the method a step may have on the device, of a config in which all else
+            is decided.
 
     Returns:
         What is used, and a row for each choice.
@@ -163,20 +190,29 @@ def resolve(
         RecordingError: The depth of the scene cannot be measured, or a preset selects frames that are not there.
         FlagError: A setting asks for what there is not.
     """
-    return _Resolver(config, recording, preset, probe).resolution()
+    return _Resolver(config, recording, preset, probe, batch_factor).resolution()
 
 
 class _Resolver:
-    def __init__(self, config: PipelineConfig, recording: EventRecording, preset: str | None, probe: Probe | None):
-        self.config, self.probe = config, probe
+    def __init__(
+        self,
+        config: PipelineConfig,
+        recording: EventRecording,
+        preset: str | None,
+        probe: Probe | None,
+        batch_factor: Callable[[Any], int],
+    ):
+        self.config, self.probe, self.batch_factor = config, probe, batch_factor
         self.values: dict[str, Any] = {}
         self.choices: list[Choice] = []
         self.selection: list[str] = []
         self.preset_values: dict[str, Any] = {}
+        self._blind_why = ""
         if preset is not None:
             name, whole = preset_named(preset), config.defaults.whole_preset
             self.preset_values, self.selection = selections(name, recording, self.parser, whole)
             self._note_flags()
+        self.train_frames = self.use(f"{DATAPARSER}.train_frames", lambda: "blurred")
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
         parser = self.parser
         selection = parser.keep_hot_pixels, parser.keep_pose_gaps, parser.undistort
@@ -238,6 +274,7 @@ class _Resolver:
         self._grid()
         self._rays()
         self._gloss()
+        self._batch()
         return Resolution(self.values, tuple(self.choices), tuple(self.selection))
 
     def _note_flags(self) -> None:
@@ -293,20 +330,26 @@ class _Resolver:
         why = "what is learnt is checked by them" if share else "the correlation of events is that of training pairs"
         self.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
         pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
-        blind = self.use("model.sensor.refractory_period_ns", lambda: recording.refractory_period)
+        blind = self.use("model.sensor.refractory_period_ns", self._refractory_period)
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
         longest = LONGEST_ACCUMULATION * 1e-6 * (recording.span[1] - recording.span[0])
+        distance, noise = LONGEST_DISTANCE, ""
+        if mode == "partner" and defaults.learns_sensor and self.use_events:
+            found = self._noise.value
+            distance = max(2, min(LONGEST_DISTANCE, round(MOST_NOISE / max(found, 1e-9))))
+            noise = f"; their noise adds {found:.2g} squared thresholds an event"
+        distance = self.use("datamanager.max_pair_distance", lambda: distance)
         window = self.use("datamanager.window_ms", lambda: longest if mode == "accumulated" else DEFAULT_WINDOW_MS)
         if not self.use_events:
             self.row("event loss", False, "", f"supervision is {data.supervision}", "datamanager.supervision")
             return
         values = {
             "successor": "each event with the pixel's next",
-            "partner": f"each event with one of the pixel's next {data.max_pair_distance}",
+            "partner": f"each event with one of the pixel's next {distance}",
             "window": f"each event with the pixel's last in {window:g} ms",
             "accumulated": f"the sum of a pixel's events over up to {window:g} ms",
         }
-        why = "learns from events"
+        why = "learns from events" + noise
         if blind and mode != "successor":
             why += "; while pixels are blind after an event, only datamanager.pair-mode successor is exact"
         self.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why, "datamanager.supervision")
@@ -340,32 +383,71 @@ class _Resolver:
             why = "the method does without"
         self.row("silent pixels", bool(silent_pairs), value, self.why(name, why), name)
 
+    @cached_property
+    def _noise(self) -> Estimate:
+        index = index_events(self.recording)
+        num_on = index.num_positive
+        return noise_per_event(index, (float(max(len(index) - num_on, 1)), float(max(num_on, 1))))
+
+    def _refractory_period(self) -> int:
+        """The recording's own, else what its events tell, ns."""
+        self._blind_why = "the recording states it"
+        if self.recording.refractory_period or not (self.use_events and self.config.defaults.learns_sensor):
+            return self.recording.refractory_period
+        found = refractory_period(index_events(self.recording))
+        self._blind_why = found.why if found else ""
+        return round(found.value) if found else 0
+
     def _sensor(self) -> None:
-        """What the sensor is like that made the events."""
+        """What the sensor is like that made the events, and what of it is learned."""
         recording = self.recording
+        learns = self.use_events and self.config.defaults.learns_sensor
+        name = "model.sensor.refractory_period_ns"
+        blind = attrgetter(name)(Resolution(self.values).applied_to(self.config))
+        value = f"blind for {blind * 1e-6:.4g} ms after an event" if blind else ""
+        why = self._blind_why if blind else "the recording states none, and its events show none"
+        self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
+
         name = "model.sensor.contrast_thresholds"
-        counts = None
+        assumed: tuple[Estimate, Estimate, bool] | None = None
 
         def from_recording() -> tuple[float, float]:
-            nonlocal counts
+            nonlocal assumed
             if recording.contrast_thresholds is not None:
                 return recording.contrast_thresholds
-            index = index_events(recording)
-            counts = index.num_positive, len(index) - index.num_positive
-            return thresholds_from_polarity(*counts)
+            assumed = contrast_thresholds(recording, bool(blind))
+            return assumed[0].value, assumed[1].value
 
         on, off = self.use(name, from_recording)
-        why = "the recording states them"
-        if counts is not None:
-            why = f"{counts[0]:,} on and {counts[1]:,} off events; their mean is assumed"
+        ratio = self.use(
+            "model.sensor.learn_threshold_ratio", lambda: learns and assumed is not None and bool(blind)
+        )  # where pixels are never blind, counts tell it better: on slider_depth what was learned drifted by a fifth
+        mean = self.use("model.sensor.learn_mean_threshold", lambda: learns and assumed is not None and self.use_frames)
+        why = self.why(name, "the recording states them" if assumed is None else assumed[0].why)
+        learned = " and ".join(["their ratio"] * ratio + ["their mean"] * mean)
         value = f"on {on:.3f}, off {off:.3f}" if on != off else f"{on:.3f} for both"
-        self.row("threshold per polarity", self.use_events and on != off, value, self.why(name, why), name)
+        value += f"; {learned} {'are' if ratio and mean else 'is'} learned" if learned else ""
+        self.row("threshold per polarity", self.use_events and (on != off or ratio), value, why, name)
 
-        name = "model.sensor.refractory_period_ns"
-        blind = self.use(name, lambda: recording.refractory_period)
-        value = f"blind for {blind * 1e-6:g} ms after an event" if blind else ""
-        why = "the recording states it" if blind else "the recording states none"
-        self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
+        name = "model.sensor.learn_threshold_map"
+        index = index_events(recording) if self.use_events else None
+        spread = threshold_spread(index, (on, off)) if learns and assumed is not None and index is not None else None
+        kept = self.use(name, lambda: spread is not None)
+        why = spread.why if spread else "events do not show that the thresholds of pixels differ"
+        value = "thresholds of each pixel are learned" if kept else ""
+        self.row("threshold map", kept, value, self.why(name, why), name)
+
+        for part, setting, what in (
+            ("leak", "leak_rate", "what the memory of pixels loses by itself"),
+            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness"),
+        ):
+            name = f"model.sensor.learn_{setting}"
+            given = attrgetter(f"model.sensor.{setting}")(self.config)
+            kept = self.use(name, lambda given=given: learns and assumed is not None and not given)
+            why = "the sensor is unknown, and it is one number" if kept else "the sensor is known"
+            why = "set by flag" if given else self.why(name, why if learns else "the method does without")
+            value = f"{what} is {'learned' if kept else f'{given:g}'}" if kept or given else ""
+            self.row(part, self.use_events and bool(kept or given), value, why, name)
 
         name = "model.sensor.response"
         stated = recording.response if self.use_frames else None
@@ -376,9 +458,16 @@ class _Resolver:
             why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
         self.row("response", self.use_events, response, self.why(name, why), name)
 
+        name = "model.level_loss_weight"
+        alone = self.use_events and not self.use_frames
+        weight = self.use(name, lambda: self.config.defaults.level_loss_weight if alone else 0.0)
+        why = "events leave the level of brightness open" if alone else "frames tell the level of brightness"
+        self.row("level of brightness", bool(weight), f"held near {MEAN_BRIGHTNESS:g}", self.why(name, why), name)
+
         name = "model.sensor.bayer_pattern"
         pattern = self.use(name, lambda: recording.bayer_pattern or GREY)
         self.use("model.sensor.width", lambda: recording.camera.width)
+        self.use("model.sensor.height", lambda: recording.camera.height)
         if pattern != GREY:
             _check("--pipeline.model.bayer-pattern", lambda: ColourFilter(pattern, recording.camera.width))
 
@@ -388,9 +477,17 @@ class _Resolver:
         spread = 0.0
         if self.use_events:
             thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
-            spread = log_brightness_range(index_events(self.recording), thresholds)
-            fits = "more" if spread > LOG_SIGMOID_RANGE else "less"
-            why = f"events of a pixel span {spread:.2g} of log brightness, {fits} than {LOG_SIGMOID_RANGE:g}"
+            index = index_events(self.recording)
+            spread = log_brightness_range(index, thresholds)
+            noise = 0.0
+            if self.config.defaults.learns_sensor:
+                walk = math.sqrt(self._noise.value * float(index.offsets.diff().median()))
+                noise = min(RANGE_OF_NOISE * 0.5 * sum(thresholds) * walk, spread)
+            fits = "more" if spread - noise > LOG_SIGMOID_RANGE else "less"
+            why = f"events of a pixel span {spread:.2g} of log brightness, "
+            why += f"of which {noise:.2g} may be noise, " if noise else ""
+            spread -= noise
+            why += f"{fits} than {LOG_SIGMOID_RANGE:g}"
         activation = self.use(name, lambda: "exponential" if spread > LOG_SIGMOID_RANGE else "log-sigmoid")
         self.row("high dynamic range", activation == "exponential", activation, self.why(name, why), name)
 
@@ -404,7 +501,7 @@ class _Resolver:
             why = f"supervision is {data.supervision}" if recording.has_frames else "the recording holds no frames"
             self.row("frame loss", False, "", why, name)
             return
-        blurred = self.parser.train_frames == "blurred" and recording.blurred_frames is not None
+        blurred = self.train_frames == "blurred" and recording.blurred_frames is not None
         what = "blurred frames" if blurred else "sharp frames"
         if blurred and recording.reconstructed_by is not None:
             what = f"frames of events, by {recording.reconstructed_by}"
@@ -555,6 +652,18 @@ class _Resolver:
             why += f", and it lowers the error of held-out pairs by {100 * gain:.1f} ± {100 * error:.1f} %"
         kept = self.use(name, lambda: bool(kept))
         self.row("view direction", kept, "", self.why(name, why), name)
+
+    def _batch(self) -> None:
+        """How many rays a step has, where neither the user nor a preset nor the paper says."""
+        names = [f"datamanager.{name}" for name in ("event_pairs", "silent_pairs", "train_num_rays_per_batch")]
+        chosen = [name for name in names if name in self.values and name not in self.preset_values]
+        if self.config.defaults.whole_preset or chosen != names:
+            return
+        factor = self.batch_factor(Resolution(self.values).applied_to(self.config))
+        if factor > 1:
+            self.values |= {name: factor * self.values[name] for name in names}
+            value = f"{factor} times the pairs and rays of the method"
+            self.row("larger batch", True, value, "a step takes hardly longer with them", names[0])
 
 
 def _path_extent(recording: EventRecording) -> float:

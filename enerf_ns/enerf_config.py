@@ -39,6 +39,18 @@ class DecayOverRunSchedulerConfig(ExponentialDecaySchedulerConfig):
     """Step at which lr_final is reached. None: the last step of the run."""
 
 
+SENSOR_LEARNING_RATES = {
+    "threshold_ratio": 1e-2,
+    "mean_threshold": 3e-3,
+    "refractory_period": 3e-3,
+    "response": 1e-2,
+    "bandwidth": 3e-2,
+    "leak_rate": 3e-2,
+    "sensor": 1e-3,
+}
+"""Learning rates of what is learned of the sensor, by the name of its group; parameters near 1."""
+
+
 def method_config(
     name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
 ) -> EnerfTrainerConfig:
@@ -59,13 +71,16 @@ def method_config(
                 "optimizer": FusedAdamOptimizerConfig(lr=learning_rate, eps=1e-15),
                 "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * learning_rate),
             },
-            "sensor": {
-                "optimizer": AdamOptimizerConfig(lr=1e-3, eps=1e-15),
-                "scheduler": DecayOverRunSchedulerConfig(lr_final=1e-4),
+            **{
+                name: {
+                    "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
+                    "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * rate),
+                }
+                for name, rate in SENSOR_LEARNING_RATES.items()
             },
         },
         viewer=ViewerConfig(quit_on_train_completion=True),
-        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False)),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         vis="viewer",
     )
 
@@ -121,6 +136,8 @@ PAPER = MethodDefaults(
     event_loss="squared",
     no_event_loss_weight=5.0,  # 1 / C at the paper's C = 0.2: its weight of 1
     no_event_margin=1.0,
+    level_loss_weight=0.0,
+    learns_sensor=False,
     whole_preset=True,
 )
 

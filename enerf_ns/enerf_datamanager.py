@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from pathlib import Path
+from typing import Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
 from jaxtyping import Int64
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from torch import Tensor
-from tyro.conf import OmitSubcommandPrefixes, Suppress
+from tyro.conf import Fixed, OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
 from enerf_ns.dataparsers.errors import FlagError
@@ -69,8 +71,9 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. Or no two events,
     but a window of any length whose events are summed, as in EventNeRF (accumulated). None: one of the next few, but
     the next where the sensor has a refractory period, in which changes go unseen."""
-    max_pair_distance: int = 10
-    """Events of the pixel that a partner may lie ahead, for pair-mode partner."""
+    max_pair_distance: Optional[int] = None  # noqa: UP045
+    """Events of the pixel that a partner may lie ahead, for pair-mode partner. None: as many as the noise of the events
+    leaves worth adding up, at most 10."""
     window_ms: Optional[float] = None  # noqa: UP045
     """Length of the windows for pair-mode window, and of the longest for accumulated. None: 60; for accumulated a
     twentieth of the recording."""
@@ -95,6 +98,18 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     seen in the middle. None: as many as the motion needs, where the exposures are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
+    # What Nerfstudio's own data manager has, and this one has no use for, is no flag.
+    masks_on_gpu: Fixed[bool] = False
+    images_on_gpu: Fixed[bool] = False
+    train_num_images_to_sample_from: Fixed[int] = -1
+    train_num_times_to_repeat_images: Fixed[int] = -1
+    eval_num_rays_per_batch: Fixed[int] = 1024
+    eval_num_images_to_sample_from: Fixed[int] = -1
+    eval_num_times_to_repeat_images: Fixed[int] = -1
+    eval_image_indices: Fixed[Optional[Tuple[int, ...]]] = (0,)  # noqa: UP006, UP045
+    patch_size: Fixed[int] = 1
+    camera_optimizer: Fixed[Optional[CameraOptimizerConfig]] = None  # noqa: UP045
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Reads config.yml of runs from before events were held out, too."""
         self.__dict__.update({"held_out_events": 0.0, **state})
@@ -106,6 +121,14 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     config: EnerfDataManagerConfig
     train_dataset: EventDataset
     eval_dataset: EventDataset
+
+    def __init__(self, config: EnerfDataManagerConfig, *args: Any, **kwargs: Any):
+        config = replace(config, dataparser=replace(config.dataparser, picture_files=False))
+        super().__init__(config, *args, **kwargs)
+
+    def get_datapath(self) -> Path:
+        """Where `ns-viewer` keeps camera paths: not with the recording, which is only read."""
+        return Path.cwd()
 
     def setup_train(self) -> None:
         config = self.config
@@ -159,7 +182,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             return EventPairSampler(
                 self.index,
                 config.pair_mode,
-                max_distance=config.max_pair_distance,
+                max_distance=config.max_pair_distance or 1,
                 window_ns=window_ns,
                 uniform_over=config.uniform_over,
                 stretches=self._stretches,
@@ -173,7 +196,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         spans = torch.from_numpy(overlaps(self.recording.stretches, self.held_out_spans)).to(self.device)
         try:
             successors = self.config.pair_mode == "successor"
-            return HeldOutPairSampler(self.index, spans, 1 if successors else self.config.max_pair_distance)
+            return HeldOutPairSampler(self.index, spans, 1 if successors else self.config.max_pair_distance or 1)
         except ValueError as error:
             return str(error)
 
@@ -196,10 +219,15 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return self._posed(self.recording.camera, self.recording.trajectory)
 
     @cached_property
+    def event_camera_without_distortion(self) -> PosedCamera:
+        """The camera of undistorted pictures of the events, in the scene."""
+        return self._posed(self.recording.camera.undistorted(), self.recording.trajectory)
+
+    @cached_property
     def frame_camera(self) -> PosedCamera:
-        """The camera of the frames that are learnt from, without distortion, in the scene."""
+        """The camera of the pictures that are learnt from, in the scene."""
         frames = self._frames
-        return self._posed(frames.camera.undistorted(), frames.trajectory)
+        return self._posed(frames.picture_camera, frames.trajectory)
 
     @cached_property
     def frame_colours(self) -> Tensor:
@@ -221,7 +249,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         config, events, frames = self.config, None, None
         if "events" in config.supervision:
             assert config.event_pairs is not None
-            events = self.pair_sampler.sample(config.event_pairs, self.generator)
+            blind = sensor.refractory_period if sensor.lags else None
+            events = self.pair_sampler.sample(config.event_pairs, self.generator, blind)
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)
@@ -306,7 +335,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def _frame_pixels(self, number: int) -> Tensor:
         """Frame, row and column of pixels drawn evenly, shape (number, 3)."""
-        camera = self._frames.camera
+        camera = self.frame_camera.camera
         sizes = len(self._frames.times), camera.height, camera.width
         draws = [torch.randint(size, (number,), generator=self.generator, device=self.device) for size in sizes]
         return torch.stack(draws, dim=-1)
@@ -338,5 +367,5 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def _frame_rays(self, indices: Tensor, times: Tensor) -> RayBundle:
         _, row, column = indices.T
-        pixels = row * self._frames.camera.width + column
+        pixels = row * self.frame_camera.camera.width + column
         return self.frame_camera.rays(pixels.repeat_interleave(times.shape[1]), times.flatten())

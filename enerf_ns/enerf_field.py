@@ -121,17 +121,24 @@ class HashDensity(nn.Module):
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
         """Density in 1 / scene unit, and the features."""
-        if self.contraction is not None:
-            unit = 0.5 + 0.25 * self.contraction(positions)
-        else:
-            unit = SceneBox.get_normalized_positions(positions, self.aabb)
-        # rows of a matrix: where there are more axes, PyTorch multiplies in another way, which is slower
-        output = self.network(self.grid(unit.clamp(0.0, 1.0).view(-1, 3)))
-        output = output.view(*positions.shape[:-1], output.shape[-1])
-        density = self.init_density * limited_exp(widened(output[..., :1]))
+        unit = self.unit(positions)
+        density, features = self.at(unit.clamp(0.0, 1.0))
         if self.contraction is None:
             density = density * ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
-        return density, output[..., 1:]
+        return density, features
+
+    def unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Positions as shares of the sides of the box, or of contracted space: in [0, 1] where density may be."""
+        if self.contraction is not None:
+            return 0.5 + 0.25 * self.contraction(positions)
+        return SceneBox.get_normalized_positions(positions, self.aabb)
+
+    def at(self, unit: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
+        """Density in 1 / scene unit, and the features, at positions of `unit` in [0, 1], faces of the box included."""
+        # rows of a matrix: where there are more axes, PyTorch multiplies in another way, which is slower
+        output = self.network(self.grid(unit.reshape(-1, 3)))
+        output = output.view(*unit.shape[:-1], output.shape[-1])
+        return self.init_density * limited_exp(widened(output[..., :1])), output[..., 1:]
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
         """Density alone."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Annotated, Any, Dict, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
 import tyro
@@ -19,7 +19,9 @@ from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFar
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
+from tyro.conf import Fixed
 
+from enerf_ns.density_voxels import DensityVoxels
 from enerf_ns.encodings.hash_grid import backend_of
 from enerf_ns.enerf_field import EnerfField, HashDensity
 from enerf_ns.evaluation.metrics import psnr, ssim
@@ -28,12 +30,27 @@ from enerf_ns.events.batch import FrameBatch, TrainBatch
 from enerf_ns.front_to_back import front_to_back
 from enerf_ns.memory import in_parts
 from enerf_ns.ray_samplers import PairedPiecewiseSampler, PairedProposalSampler, PairedUniformSampler, paired_rand
+from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.sensor.sensor_model import SensorModelConfig
-from enerf_ns.supervision.event_supervision import EventSupervision
+from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
 from enerf_ns.supervision.losses import frame_loss
 
 FAINT = 5e-4
 """Share of a ray's light that a picture may miss for what lies behind, and as much for what is thin."""
+
+AROUND_DEPTH = 0.05
+"""How far from a ray's depth its light may come from to speak for it, as a share of the depth. Of shares of 2, 5 and
+10 %, this one tells depths that are right within 5 % best from others."""
+
+FAR_SHARE = 0.75
+"""Share of a ray's light that comes from nearer than its far depth."""
+
+MEAN_BRIGHTNESS = 0.3
+"""Geometric mean of brightness near which a field is held that learns from events alone: both what is three times as
+bright and what is a third as bright lie where the field and linlog are logarithmic."""
+
+FAINTEST = 1e-4
+"""Least brightness that counts in a mean of log brightness."""
 
 FARTHEST = 1000.0
 """Where rays end that go on beyond the box, in scene units: halves of its longest side."""
@@ -89,6 +106,9 @@ class EnerfModelConfig(ModelConfig):
     0, or as the paper for enerf-paper."""
     frame_loss_weight: float = 10.0
     """Weight of the loss on frames."""
+    level_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the squared difference between the mean log brightness of a batch and that of `MEAN_BRIGHTNESS`. None:
+    0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
     opacity_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the share of each ray that no surface stops; 0 for an object before nothing. None: 0 where the sensor's
     border is silent, else 1."""
@@ -105,6 +125,14 @@ class EnerfModelConfig(ModelConfig):
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
 
+    # What Nerfstudio's own models have, and this one has no use for, is no flag.
+    enable_collider: Fixed[bool] = True
+    collider_params: Fixed[Optional[Dict[str, float]]] = field(  # noqa: UP006, UP045
+        default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0}
+    )
+    loss_coefficients: Fixed[Dict[str, float]] = field(default_factory=dict)  # noqa: UP006
+    prompt: Fixed[Optional[str]] = None  # noqa: UP045
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Reads config.yml of runs from before the sensor had a config of its own, before contraction, and before
         fields started half opaque, too."""
@@ -113,21 +141,28 @@ class EnerfModelConfig(ModelConfig):
             state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
         if "hidden_dim_color" in state:
             state["hidden_dim_colour"] = state.pop("hidden_dim_color")
-        self.__dict__.update({"contraction": False, "init_density": 0.01, **state})
+        before = {"contraction": False, "init_density": 0.01, "level_loss_weight": 0.0}
+        self.__dict__.update({**before, **state})
 
 
 class BoxCollider(AABBBoxCollider):
     """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
 
-    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that miss
-    the box, or only graze it, are as good as without length.
+    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that say
+    themselves where they start and end, as those of a crop do, start and end there, within the box. Rays that miss the
+    box, or only graze it, are as good as without length.
     """
 
     def forward(self, ray_bundle: RayBundle) -> RayBundle:
+        given = ray_bundle.nears, ray_bundle.fars
         ray_bundle = self.set_nears_and_fars(ray_bundle)
         assert ray_bundle.nears is not None and ray_bundle.fars is not None
-        nears = ray_bundle.nears.nan_to_num(0.0, posinf=0.0).clamp(min=self.near_plane)
-        ray_bundle.nears, ray_bundle.fars = nears, torch.maximum(ray_bundle.fars.nan_to_num(0.0, 0.0), nears + 1e-4)
+        nears, fars = ray_bundle.nears.nan_to_num(0.0, posinf=0.0), ray_bundle.fars.nan_to_num(0.0, 0.0)
+        if given[0] is not None and given[1] is not None:
+            nears, fars = torch.minimum(torch.maximum(nears, given[0]), fars), torch.minimum(fars, given[1])
+        else:
+            nears = nears.clamp(min=self.near_plane)
+        ray_bundle.nears, ray_bundle.fars = nears, torch.maximum(fars, nears + 1e-4)
         return ray_bundle
 
 
@@ -147,6 +182,8 @@ class EnerfModel(Model):
     config: EnerfModelConfig
     samples_at_once: int | None = None
     """Samples that the field is asked at once; None: all (`enerf_ns.memory`)."""
+    seen_volume: Callable[[], SeenVolume] | None = None
+    """Where the events that are learnt from came from; None where there are none, as of a model by itself."""
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -159,6 +196,7 @@ class EnerfModel(Model):
             and config.view_direction is not None
             and config.opacity_loss_weight is not None
         )
+        assert config.level_loss_weight is not None
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
         self.supervision = EventSupervision(
@@ -188,7 +226,7 @@ class EnerfModel(Model):
         # what has no upper end shines through anything
         self._faint = 0.0 if config.brightness == "exponential" else FAINT
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
-        self.proposal = None
+        self.proposal = self.expected = None
         if config.sampling == "proposal":
             # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
             # thirtieth (float16) of what their jitter does
@@ -204,8 +242,9 @@ class EnerfModel(Model):
                 backend=config.hash_grid,
             )
             self.sampler = PairedProposalSampler(
-                config.num_proposal_samples, config.num_samples, first_sampler(single_jitter=True), self._faint
+                config.num_proposal_samples, config.num_samples, first_sampler(single_jitter=True)
             )
+            self.expected = DensityVoxels(self.proposal)
         else:
             self.sampler = first_sampler(num_samples=config.num_samples)
         self.renderer_rgb = RGBRenderer(background_color="random")
@@ -214,8 +253,7 @@ class EnerfModel(Model):
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {"fields": [*self.field.parameters(), *(self.proposal.parameters() if self.proposal else ())]}
-        sensor = list(self.sensor.parameters())
-        return groups | {"sensor": sensor} if sensor else groups
+        return groups | self.sensor.get_param_groups()
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -239,8 +277,8 @@ class EnerfModel(Model):
         Returns:
             rgb (rays, 3), at most 1 but where brightness is exponential, and accumulation (rays, 1). In training rgb
             has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in scene
-            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1], which are computed when they are
-            asked for, by their name.
+            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1] and confidence (rays, 1) of
+            `depth_evidence`, which are computed when they are asked for, by their name.
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
@@ -259,10 +297,10 @@ class EnerfModel(Model):
         }
 
     def _samples(self, rays: RayBundle) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
-        """Samples along rays, and weights and samples of the proposal network."""
+        """Samples along rays, and weights and samples of the proposal network, or of its voxels but in training."""
         if self.proposal is None:
             return self.sampler(rays), [], []
-        return self.sampler(rays, density_fns=[self.proposal])
+        return self.sampler(rays, density_fns=[self.proposal.density_fn if self.training else self.expected])
 
     def _picture(self, rays: RayBundle) -> Outputs:
         """What rays show, from the camera on until hardly any light is left, and the colour only of what it comes
@@ -271,7 +309,7 @@ class EnerfModel(Model):
         if backend_of(grid.backend, rays.origins, grid.table) == "numba" and not torch.is_grad_enabled():
             from enerf_ns.rendering_numba import render  # here, since Numba may be missing
 
-            rgb, accumulation, depth = render(rays, self.field, self.sampler, self.proposal, self._faint)
+            rgb, accumulation, depth = render(rays, self.field, self.sampler, self.expected, self._faint)
         else:
             samples, _, _ = self._samples(rays)
             rgb = rays.origins.new_zeros(len(rays), self.field.num_channels)
@@ -287,11 +325,12 @@ class EnerfModel(Model):
             accumulation=accumulation,
             depth=depth,
             normals=lambda: self.normals(rays.origins + rays.directions * depth),
+            confidence=lambda: self.depth_evidence(rays, depth)[0],
         )
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Outputs:
-        """What the rays of a picture show, each of shape (height, width, its size); normals where they are asked for,
-        by their name."""
+        """What the rays of a picture show, each of shape (height, width, its size); normals and confidence where they
+        are asked for, by their name."""
         outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
 
         def normals() -> Tensor:
@@ -301,7 +340,39 @@ class EnerfModel(Model):
             return torch.cat(found).view(points.shape)
 
         outputs["normals"] = normals
+        outputs["confidence"] = lambda: self.depth_evidence(camera_ray_bundle, outputs["depth"])[0]
         return outputs
+
+    @torch.no_grad()
+    def depth_evidence(self, rays: RayBundle, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the depth of rays is known, and how far away their surfaces may be where it is not.
+
+        Args:
+            rays: Of any shape.
+            depth: Of the rays, shape (*batch, 1), scene units along the ray.
+
+        Returns:
+            The confidence in the depth, from 0 to 1: the share of a ray's light that comes from within `AROUND_DEPTH`
+            of it, times the evidence of the events that came from there (`SeenVolume.evidence`; beyond the scene box
+            there is none); and the far depth, in scene units along the ray, nearer than which `FAR_SHARE` of the light
+            comes from. Both have the shape of depth, and are on its device.
+        """
+        volume = self.seen_volume() if self.seen_volume else None
+        size, confidence, far = self.config.eval_num_rays_per_chunk, [], []
+        for start in range(0, len(rays), size):
+            chunk = rays.flatten()[start : start + size].to(self.device)
+            middle = depth.reshape(-1, 1)[start : start + size].to(self.device)
+            samples, _, _ = self._samples(self.collider(chunk))
+            weights = front_to_back(samples, self.field.geometry, self._faint, samples_at_once=self.samples_at_once)
+            places = (samples.frustums.starts + samples.frustums.ends) / 2.0
+            share = (weights * ((places - middle[:, None]).abs() <= AROUND_DEPTH * middle[:, None])).sum(dim=1)
+            if volume is not None:
+                share = share * volume.evidence(chunk.origins + chunk.directions * middle)[:, None]
+            stopped = weights.cumsum(dim=1)
+            reached = (stopped >= FAR_SHARE * stopped[:, -1:]).int().argmax(dim=1, keepdim=True)
+            confidence.append(share.clamp(max=1.0))
+            far.append(places.gather(1, reached)[:, 0])
+        return tuple(torch.cat(parts).view(depth.shape).to(depth.device) for parts in (confidence, far))  # type: ignore
 
     @torch.no_grad()
     def normals(self, points: Tensor) -> Tensor:
@@ -325,6 +396,12 @@ class EnerfModel(Model):
         losses: dict[str, Tensor] = {}
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
+            if self.training and self.sensor.threshold_map is not None:
+                self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
+            if self.training and config.level_loss_weight:
+                seen = self.sensor.brightness(torch.cat([start, end]), batch.events.pixels.repeat(2))
+                level = (seen.clamp(min=FAINTEST) / MEAN_BRIGHTNESS).log().mean()
+                losses["level_loss"] = config.level_loss_weight * level.square()
         if batch.frames is not None:
             losses["frame_loss"] = config.frame_loss_weight * self._frame_loss(frames, batch.frames)
         if self.training:

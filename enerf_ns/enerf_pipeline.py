@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import TYPE_CHECKING, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
 from nerfstudio.models.base_model import Model
@@ -15,9 +15,10 @@ from torch.distributed import barrier
 from torch.nn.parallel import DistributedDataParallel
 from tyro.conf import Fixed, Suppress
 
-from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
 from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
+from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
+from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -25,11 +26,15 @@ from enerf_ns.evaluation.protocols import described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import TrainBatch
-from enerf_ns.ffmpeg import make_ffmpeg_available
 from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
+from enerf_ns.quiet import silence_known_warnings
+from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.stopwatch import Stopwatch
 from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.terminal import say
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.viewer_elements import ViewerControl
 
 
 @dataclass
@@ -50,13 +55,17 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
         Raises:
             SystemExit: The recording cannot be used, or not so; with one sentence.
         """
+        silence_known_warnings()
         make_ffmpeg_available()
         allow_numpy_scalars_in_checkpoints()
         with exit_with_a_sentence():
             resolution = self.resolution
             if not resolution.choices:
                 resolution = resolve(self, self.datamanager.dataparser.setup().recording())
-            return self._target(resolution.applied_to(self), **kwargs)
+            filled = resolution.applied_to(self)
+            if kwargs.get("test_mode") == "inference":  # ns-render dataset makes data managers of this config, too
+                self.datamanager = filled.datamanager
+            return self._target(filled, **kwargs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Reads config.yml of runs from before choices were stored apart from what was set, too."""
@@ -83,6 +92,7 @@ class EnerfPipeline(VanillaPipeline):
     config: EnerfPipelineConfig
     last_step: TrainStep
     """The last training step, once there was one."""
+    _seen: tuple[int, SeenVolume] | None = None
 
     def __init__(
         self, config: EnerfPipelineConfig, device: str, world_size: int = 1, local_rank: int = 0, **kwargs: Any
@@ -93,6 +103,8 @@ class EnerfPipeline(VanillaPipeline):
         self.seconds_a_step: float | None = None
         """What a training step will take; None where nobody needs to know, since it is small."""
         self._fit_memory(trains=kwargs.get("test_mode", "val") == "val")
+        self._viewer: ViewerControl | None = None
+        self.model.seen_volume = self.seen_volume
         self.world_size = world_size
         if world_size > 1:  # here, since Nerfstudio takes every device for a GPU
             gpus = [local_rank] if torch.device(device).type == "cuda" else None
@@ -103,6 +115,23 @@ class EnerfPipeline(VanillaPipeline):
     @property
     def model(self) -> EnerfModel:
         return super().model  # type: ignore
+
+    @property
+    def viewer(self) -> ViewerControl:
+        """What makes Nerfstudio's viewer one on the recording; the viewer looks for it among the attributes of the
+        pipeline, and nobody else asks."""
+        if self._viewer is None:
+            from enerf_ns.viewer.scene_view import SceneView  # here, since hardly any command shows a viewer
+
+            self._viewer = SceneView(self.model, self.datamanager)
+        return self._viewer
+
+    def seen_volume(self) -> SeenVolume:
+        """What the events' camera saw of the field as it is; made when it is first asked for after a training step."""
+        steps = self.datamanager.train_count
+        if self._seen is None or self._seen[0] != steps:
+            self._seen = steps, SeenVolume.of(self.model, self.datamanager)
+        return self._seen[1]
 
     def _fit_memory(self, trains: bool) -> None:
         """Has the field be asked in parts where a training step, or a part of a picture, would not fit the memory.
@@ -169,12 +198,13 @@ class EnerfPipeline(VanillaPipeline):
         if isinstance(sampler, str):
             return dict.fromkeys(EVENT_SCORES, sampler)
         self.eval()
-        batch = sampler.sample(num_pairs, torch.Generator(self.device).manual_seed(0))
+        blind = sensor.refractory_period if sensor.lags else None
+        batch = sampler.sample(num_pairs, torch.Generator(self.device).manual_seed(0), blind)
         rays = manager.event_rays(batch, sensor).reshape((2, num_pairs))
         start, end = self.model.get_outputs_for_camera_ray_bundle(rays)["rgb"]
         self.train()
         change = brightness_change(start, end, batch, sensor)
-        measured = sensor.measured_change(batch.on, batch.off, batch.pixels)
+        measured = sensor.measured_change(batch)
         return event_scores(change, measured, float(sensor.mean_threshold))
 
     def get_average_eval_image_metrics(

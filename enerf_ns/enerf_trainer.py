@@ -9,6 +9,7 @@ import signal
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType
 from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
@@ -22,6 +23,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from torch import Tensor
+from tyro.conf import Fixed
 
 from enerf_ns.checkpoints import (
     checkpoint_path,
@@ -51,10 +53,12 @@ from enerf_ns.guarded_steps import (
     why_nothing_is_learnt,
 )
 from enerf_ns.probe import view_direction_gain
+from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.ranges import check_ranges
 from enerf_ns.tables import choices_table, recording_table
-from enerf_ns.terminal import clear_line, duration, say
+from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
 from enerf_ns.threads import SharedCores
+from enerf_ns.throughput import batch_factor
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
@@ -69,6 +73,7 @@ class EnerfTrainerConfig(TrainerConfig):
 
     _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
+    prompt: Fixed[Optional[str]] = None  # noqa: UP045
     preset: Optional[str] = None  # noqa: UP045
     """The selections of the E-NeRF paper for one of its sequences; flags that are set stand. One of eds00, eds11,
     mocap-1d-trans, mocap-desk2, mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse,
@@ -89,7 +94,7 @@ class EnerfTrainerConfig(TrainerConfig):
             OutputError: The run's folder holds another run.
         """
         check_ranges(self)
-        self._check_hash_grid()
+        self._check_device()
         config = deepcopy(self)
         pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
         data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
@@ -97,6 +102,7 @@ class EnerfTrainerConfig(TrainerConfig):
             raise FlagError("--data is missing; give the folder of a recording")
         config.data = pipeline.datamanager.data = parser.data = data.expanduser().resolve()
         config.output_dir = self.output_dir.expanduser().resolve()
+        config._check_output_dir()
         config.load_dir = self.load_dir and self.load_dir.expanduser().resolve()
         config.load_checkpoint = self.load_checkpoint and self.load_checkpoint.expanduser().resolve()
         checkpoint = config.checkpoint()
@@ -108,17 +114,36 @@ class EnerfTrainerConfig(TrainerConfig):
             recording = parser.setup().recording()
             optimizer, device = config.optimizers["fields"]["optimizer"], config.machine.device_type
             pipeline.resolution = resolve(
-                pipeline, recording, self.preset, lambda filled: view_direction_gain(filled, optimizer, device)
+                pipeline,
+                recording,
+                self.preset,
+                lambda filled: view_direction_gain(filled, optimizer, device),
+                lambda filled: batch_factor(filled, device),
             )
         index_events(config.recording())
         return config
 
-    def _check_hash_grid(self) -> None:
-        """Refuses a backend that is not there or does not run on the device.
+    def _check_output_dir(self) -> None:
+        """Refuses a place where no folder of a run can be, before anything that takes time.
+
+        Raises:
+            OutputError: It is the one that is set.
+        """
+        there = next(folder for folder in (self.output_dir, *self.output_dir.parents) if folder.exists())
+        try:
+            with TemporaryFile(dir=there):
+                pass
+        except OSError as error:
+            raise _unwritable(self.output_dir, error) from error
+
+    def _check_device(self) -> None:
+        """Refuses a device, or a backend of the hash grid, that is not there.
 
         Raises:
             FlagError: It is the one that is set.
         """
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise FlagError("--machine.device-type is cuda, but no GPU can be used; check its driver, or give cpu.")
         name = self.pipeline.model.hash_grid
         if name not in ("auto", "torch"):
             positions = torch.empty(0, 3, device=self.machine.device_type)
@@ -186,6 +211,9 @@ class EnerfTrainerConfig(TrainerConfig):
             self.load_step = int(newest.stem.removeprefix("step-"))
         return folder
 
+    def print_to_terminal(self) -> None:
+        """Prints nothing: what is chosen is a table, and all settings are in config.yml."""
+
     def save_config(self) -> None:
         """Show what the recording holds and what is made of it, then store both with the run."""
         with exit_with_a_sentence():
@@ -200,16 +228,21 @@ class EnerfTrainerConfig(TrainerConfig):
             try:
                 write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
             except OSError as error:
-                raise OutputError(
-                    f"{folder} could not be written to ({error.strerror}); make room, or give another --output-dir."
-                ) from error
+                raise _unwritable(folder, error) from error
+            say_where("configuration", str(folder / "config.yml"))
 
     def setup(self, **kwargs: Any) -> EnerfTrainer:
         """The trainer, of what this config comes to on its recording."""
         with exit_with_a_sentence():
+            silence_known_warnings()
             config = self.resolved()
             config.load_checkpoint, config.load_dir = config.checkpoint(), None
-            return self._target(config, **kwargs)
+            with without_chatter():
+                return self._target(config, **kwargs)
+
+
+def _unwritable(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"{folder} could not be written to ({error.strerror}); make room, or give another --output-dir.")
 
 
 class EnerfTrainer(Trainer):
@@ -238,8 +271,13 @@ class EnerfTrainer(Trainer):
         self._cores: SharedCores | None = None  # while it trains on them
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        super().setup(test_mode)
         config = self.config
+        data, config.data = config.data, None  # so that the viewer keeps camera paths with the run
+        try:
+            with without_chatter():
+                super().setup(test_mode)
+        finally:
+            config.data = data
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )
@@ -464,17 +502,18 @@ class EnerfTrainer(Trainer):
             writer.write_out_storage()
             clear_line()
             self._say_skipped()
-            CONSOLE.print(
-                f"[bold]continue:[/bold] ns-train {self.config.method_name} --load-config {config}",
-                soft_wrap=True,
-                highlight=False,
-            )
+            say_where("continue", f"ns-train {self.config.method_name} --load-config {config}")
             raise SystemExit(130)
-        super()._after_train()
+        with without_chatter():
+            super()._after_train()
         if self._unsaved:
             raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and train on.")
         CONSOLE.rule("Training is done")
         self._say_skipped()
+        learned = self.pipeline.model.sensor.learned()
+        if learned:
+            numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
+            say(f"The sensor as it was learned: {numbers}.")
         for what, where in {
             "checkpoint": str(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
@@ -482,7 +521,7 @@ class EnerfTrainer(Trainer):
             "video of your own": f"ns-render interpolate --load-config {config} --output-path video.mp4",
             "look around": f"ns-viewer --load-config {config}",
         }.items():
-            CONSOLE.print(f"[bold]{what}:[/bold] {where}", soft_wrap=True, highlight=False)
+            say_where(what, where)
 
     def _say_skipped(self) -> None:
         if self.num_skipped:

@@ -244,7 +244,7 @@ class ErrorAgainstTime:
             found = summary_scores(views, summary)
             not_scored = found.pop("not_scored", {})
         elif pipeline.datamanager.eval_dataset.are_frames:
-            views, _ = held_out_views(pipeline, self._numbers, self._reduced_by)
+            views, _ = held_out_views(pipeline, self._numbers, self._reduced_by, evidence=False)
             found, places = mean_scores(views)
             for name, reasons in places.items():
                 not_scored[name] = {why: [self._numbers[place] for place in left] for why, left in reasons.items()}

@@ -122,7 +122,7 @@ def why_nothing_is_learnt(step: TrainStep, sensor: SensorModel) -> dict[str, str
         start, end, _ = step.batch.split(step.rgb)
         fired = events.fired
         change = brightness_change(start, end, events, sensor)[fired]
-        measured = sensor.measured_change(events.on[fired], events.off[fired], events.pixels[fired])
+        measured = sensor.measured_change(events)[fired]
         ratio = float(change.square().mean().sqrt() / measured.square().mean().sqrt())
         if ratio < NOTHING:
             found["constant"] = f"the rendered change of log brightness is {ratio:.1g} of the measured one"

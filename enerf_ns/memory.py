@@ -79,6 +79,22 @@ def kept_bytes(call: Callable[[], Any], model: Model) -> int:
     return sum(kept.values())
 
 
+def rays_from_the_middle(model: Model, num_rays: int) -> RayBundle:
+    """Rays from the middle of the scene in random directions, on the device of the model."""
+    box = model.scene_box.aabb
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, 3, device=box.device), dim=-1)
+    pixel_area = torch.full((num_rays, 1), 1e-6, device=box.device)
+    return RayBundle(box.mean(dim=0).expand(num_rays, 3), directions, pixel_area)
+
+
+def forward_and_backward(model: Model, rays: RayBundle) -> None:
+    """Renders rays as in training, and finds the gradients of all parameters, which it throws away."""
+    outputs: Any = model.get_outputs(rays)
+    loss = outputs["rgb"].sum() + outputs["accumulation"].sum()
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    torch.autograd.grad(loss, parameters, allow_unused=True)
+
+
 def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
     """What a training step takes, from rendering some rays out of the middle of the scene.
 
@@ -91,22 +107,13 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
     device = model.scene_box.aabb.device
     devices = [device] if device.type == "cuda" else []
     field: Any = model.field
-    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     number = max(16, PROBE_SAMPLES // num_samples)
     with torch.random.fork_rng(devices):
-        directions = torch.nn.functional.normalize(torch.randn(number, 3, device=device), dim=-1)
-        middle = model.scene_box.aabb.mean(dim=0)
-        rays = RayBundle(middle.expand(number, 3), directions, torch.full((number, 1), 1e-6, device=device))
+        rays = rays_from_the_middle(model, number)
         was_training = model.training
         model.train()
-
-        def forward_and_backward() -> None:
-            outputs: Any = model.get_outputs(rays)
-            loss = outputs["rgb"].sum() + outputs["accumulation"].sum()
-            torch.autograd.grad(loss, parameters, allow_unused=True)
-
-        forward_and_backward()  # compiles
-        seconds = seconds_of(forward_and_backward, device)
+        forward_and_backward(model, rays)  # compiles
+        seconds = seconds_of(lambda: forward_and_backward(model, rays), device)
         samples: Any = model.get_outputs(rays)["ray_samples_list"][-1]
         whole = kept_bytes(lambda: model.get_outputs(rays), model)
         of_field = kept_bytes(lambda: field(samples), model)

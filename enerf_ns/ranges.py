@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from enerf_ns.dataparsers.camera import LARGEST_SIDE
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, DEPTH_LIMITS, LONGEST_REFRACTORY_PERIOD
 
@@ -53,6 +54,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_steps": (1, MOST_STEPS),
     "held_out_every": (1, 10**9),
     "exposure_ms": (0.0, 1e6),
+    "downscale_factor": (1.0, LARGEST_SIDE),
     "depth_range": DEPTH_LIMITS,
     "box": (-DEPTH_LIMITS[1], DEPTH_LIMITS[1]),
     "time_range": (-4e9, 4e9),  # in ns, differences of int64 hold them
@@ -80,7 +82,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "fisheye_crop_radius": (0.0, 1e6),
     "eval_num_rays_per_chunk": (1, MOST_DRAWS),
     "collider_params": (0.0, 1e9),
-    "loss_coefficients": WEIGHT,
     "num_levels": (1, 32),
     "base_res": (1, 2**16),
     "max_res": (1, 2**20),  # positions in [0, 1] are float32, of which 24 bits count
@@ -92,11 +93,15 @@ RANGES: dict[str, tuple[float, float]] = {
     "num_samples": (1, 2**16),
     "contrast_thresholds": CONTRAST_THRESHOLD_LIMITS,
     "refractory_period_ns": (0, LONGEST_REFRACTORY_PERIOD),
+    "leak_rate": (0.0, 1e6),
+    "cutoff_frequency": (1e-3, 1e9),
     "width": (1, 2**15),
+    "height": (1, 2**15),
     "event_loss_weight": WEIGHT,
     "no_event_loss_weight": WEIGHT,
     "no_event_margin": (0.0, 1.0),
     "frame_loss_weight": WEIGHT,
+    "level_loss_weight": WEIGHT,
     "opacity_loss_weight": WEIGHT,
     "distortion_loss_weight": WEIGHT,
     "interlevel_loss_weight": WEIGHT,
@@ -110,6 +115,9 @@ WITHOUT_KEYS = ("collider_params", "gradient_accumulation_steps")
 
 WITHOUT_FLAG = (
     *("pipeline.defaults", "pipeline.resolution", "pipeline.datamanager.pixel_sampler", "pipeline.model.sensor.width"),
+    "pipeline.model.sensor.height",
+    *("pipeline.datamanager.train_num_images", "pipeline.datamanager.train_num_times", "pipeline.datamanager.eval_"),
+    *("pipeline.datamanager.patch_size", "pipeline.model.collider_params"),
 )
 """Parts of the config that can only be set from Python."""
 

@@ -18,8 +18,6 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import Tensor
 
-from enerf_ns.front_to_back import front_to_back
-
 
 @dataclass
 class PairedRayBundle(RayBundle):
@@ -132,10 +130,9 @@ class PairedProposalSampler(ProposalNetworkSampler):
         num_proposal_samples: Of the proposal network, along a ray.
         num_samples: Along a ray.
         initial_sampler: Places the samples of the proposal network.
-        faint: Share of a ray's light behind which the proposal network is not asked, but in training.
     """
 
-    def __init__(self, num_proposal_samples: int, num_samples: int, initial_sampler: SpacedSampler, faint: float):
+    def __init__(self, num_proposal_samples: int, num_samples: int, initial_sampler: SpacedSampler):
         super().__init__(
             num_proposal_samples_per_ray=(num_proposal_samples,),
             num_nerf_samples_per_ray=num_samples,
@@ -144,7 +141,6 @@ class PairedProposalSampler(ProposalNetworkSampler):
             pdf_sampler=PairedPDFSampler(single_jitter=True),
             update_sched=lambda step: 1 if step > 500 else 0,
         )
-        self.faint = faint
 
     def generate_ray_samples(
         self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
@@ -153,22 +149,22 @@ class PairedProposalSampler(ProposalNetworkSampler):
 
         Args:
             ray_bundle: With nears and fars.
-            density_fns: The proposal network alone: density and features at positions.
+            density_fns: What expects surfaces, alone: density at positions.
         """
         assert ray_bundle is not None and density_fns is not None
-        (proposal,) = density_fns
-        if self.training:
-            pairs = getattr(ray_bundle, "num_pairs", 0)
+        (expected,) = density_fns
+        if not self.training:  # here, since Nerfstudio's counts pictures as steps
+            samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
+            weights = samples.get_weights(expected(samples.frustums.get_positions()))
+            found = self.pdf_sampler(ray_bundle, samples, weights, num_samples=self.num_nerf_samples_per_ray)
+            return found, [weights], [samples]
+        pairs = getattr(ray_bundle, "num_pairs", 0)
 
-            def density(positions: Tensor) -> Tensor:
-                found = proposal(positions[pairs:])[0]
-                return torch.cat([found[:pairs], found]) if pairs else found
+        def density(positions: Tensor) -> Tensor:
+            found = expected(positions[pairs:])
+            return torch.cat([found[:pairs], found]) if pairs else found
 
-            return super().generate_ray_samples(ray_bundle, [density])
-        samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
-        weights = front_to_back(samples, proposal, self.faint)
-        found = self.pdf_sampler(ray_bundle, samples, weights, num_samples=self.num_nerf_samples_per_ray)
-        return found, [weights], [samples]
+        return super().generate_ray_samples(ray_bundle, [density])
 
 
 def _samples(rays: RayBundle, bins: Float[Tensor, "rays edges"], to_distance) -> RaySamples:

@@ -18,6 +18,7 @@ from nerfstudio.fields.base_field import get_normalized_directions
 from torch import Tensor, nn
 
 from enerf_ns.compiled import compiled
+from enerf_ns.density_voxels import DensityVoxels
 from enerf_ns.encodings.hash_grid_numba import BLOCK, find_cells, interpolate, new_cells, on_threads
 from enerf_ns.enerf_field import DARKEST, LARGEST_EXPONENT, EnerfField, HashDensity
 from enerf_ns.ray_samplers import PairedProposalSampler, PairedSpacedSampler
@@ -105,21 +106,24 @@ def _network(layers, number, values):
 
 
 @vectorised
+def _unit(geometry, x, y, z):
+    """A position as `enerf_ns.enerf_field.HashDensity.unit` has it."""
+    if geometry.contraction:
+        distance = max(abs(x), abs(y), abs(z))
+        scale = QUARTER if distance < 1 else QUARTER * (TWO - ONE / distance) / distance
+        return HALF + scale * x, HALF + scale * y, HALF + scale * z
+    low, size = geometry.low, geometry.size
+    return (x - low[0]) / size[0], (y - low[1]) / size[1], (z - low[2]) / size[2]
+
+
+@vectorised
 def _geometry(geometry, points, number, cells, values):
     """Densities, then features, at points of shape (3, BLOCK), of which it makes positions in the grid."""
     inside = np.empty(BLOCK, np.float32)
     for p in range(number):
-        x, y, z = points[0, p], points[1, p], points[2, p]
-        if geometry.contraction:
-            distance = max(abs(x), abs(y), abs(z))
-            scale = ONE if distance < 1 else (TWO - ONE / distance) / distance
-            x, y, z = HALF + QUARTER * scale * x, HALF + QUARTER * scale * y, HALF + QUARTER * scale * z
-            inside[p] = ONE
-        else:
-            x = (x - geometry.low[0]) / geometry.size[0]
-            y = (y - geometry.low[1]) / geometry.size[1]
-            z = (z - geometry.low[2]) / geometry.size[2]
-            inside[p] = ONE if min(x, y, z) > 0 and max(x, y, z) < 1 else ZERO
+        x, y, z = _unit(geometry, points[0, p], points[1, p], points[2, p])
+        within = geometry.contraction or (min(x, y, z) > 0 and max(x, y, z) < 1)
+        inside[p] = ONE if within else ZERO
         points[0, p] = min(max(x, ZERO), ONE)
         points[1, p] = min(max(y, ZERO), ONE)
         points[2, p] = min(max(z, ZERO), ONE)
@@ -161,6 +165,44 @@ def _resample(weights, edges):
 
 
 @vectorised
+def _expect(rays, r, voxels, field, faint, weights):
+    """Weights of even stretches of a ray by densities at the corners of voxels, 0 behind what lets hardly any light
+    through."""
+    origins, directions, nears, fars, _ = rays
+    top0, top1, top2 = voxels.shape[2] - 2, voxels.shape[1] - 2, voxels.shape[0] - 2
+    size0, size1, size2 = np.float32(top0 + 1), np.float32(top1 + 1), np.float32(top2 + 1)
+    near, far, parts, light = nears[r], fars[r], np.float32(len(weights)), ONE
+    begin = _distance(ZERO, near, far, field.contraction)
+    for s in range(len(weights)):
+        end = _distance(np.float32(s + 1) / parts, near, far, field.contraction)
+        middle = HALF * (begin + end)
+        x, y, z = _unit(
+            field,
+            origins[r, 0] + directions[r, 0] * middle,
+            origins[r, 1] + directions[r, 1] * middle,
+            origins[r, 2] + directions[r, 2] * middle,
+        )
+        x, y, z = min(max(x, ZERO), ONE) * size0, min(max(y, ZERO), ONE) * size1, min(max(z, ZERO), ONE) * size2
+        # what is no number has any index
+        i, j, k = min(max(int(x), 0), top0), min(max(int(y), 0), top1), min(max(int(z), 0), top2)
+        x, y, z = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        low = (ONE - y) * ((ONE - x) * voxels[k, j, i] + x * voxels[k, j, i + 1]) + y * (
+            (ONE - x) * voxels[k, j + 1, i] + x * voxels[k, j + 1, i + 1]
+        )
+        high = (ONE - y) * ((ONE - x) * voxels[k + 1, j, i] + x * voxels[k + 1, j, i + 1]) + y * (
+            (ONE - x) * voxels[k + 1, j + 1, i] + x * voxels[k + 1, j + 1, i + 1]
+        )
+        passed = np.exp(-((ONE - z) * low + z * high) * (end - begin))
+        weight = light * (ONE - passed)
+        weights[s] = weight if weight >= 0 else ZERO  # also where it is no number
+        light *= passed
+        begin = end
+        if light <= faint:
+            weights[s + 1 :] = ZERO
+            break
+
+
+@vectorised
 def _brightness(output, activation):
     """As `enerf_ns.enerf_field.brightness_of`."""
     if activation == 2:
@@ -170,8 +212,8 @@ def _brightness(output, activation):
 
 
 @vectorised
-def _render(rays, first, last, proposal, num_proposal_samples, field, colour, activation, faint, num_samples, pictures):
-    """Rays from the first to before the last. Proposal is None where samples lie evenly along a ray."""
+def _render(rays, first, last, voxels, num_stretches, field, colour, activation, faint, num_samples, pictures):
+    """Rays from the first to before the last. Voxels is None where samples lie evenly along a ray."""
     origins, directions, nears, fars, encoded = rays
     is_piecewise = field.contraction
     rgb, accumulation, depth = pictures
@@ -184,40 +226,17 @@ def _render(rays, first, last, proposal, num_proposal_samples, field, colour, ac
     features = np.empty((num_features, RAYS * ROUND), np.float32)
     weights, seen = np.empty(RAYS * ROUND, np.float32), np.empty(RAYS * ROUND, np.int64)
     transmittance, lit = np.empty(RAYS, np.float32), np.empty(RAYS, np.int64)
+    found = np.empty(num_stretches, np.float32)
     for start in range(first, last, RAYS):
         num_rays = min(RAYS, last - start)
 
         for r in range(num_rays):
             for s in range(num_samples + 1):
                 edges[r, s] = np.float32(s) / np.float32(num_samples)
-        if proposal is not None:
-            values = _room(proposal.network)
-            found = np.empty((RAYS, num_proposal_samples), np.float32)
-            parts = np.float32(num_proposal_samples)
-            total = num_rays * num_proposal_samples
-            for block in range(0, total, BLOCK):
-                number = min(BLOCK, total - block)
-                for p in range(number):
-                    r, s = start + (block + p) // num_proposal_samples, (block + p) % num_proposal_samples
-                    near, far = nears[r], fars[r]
-                    begin = _distance(np.float32(s) / parts, near, far, is_piecewise)
-                    end = _distance(np.float32(s + 1) / parts, near, far, is_piecewise)
-                    for axis in range(3):
-                        points[axis, p] = origins[r, axis] + directions[r, axis] * HALF * (begin + end)
-                outputs = _geometry(proposal, points, number, cells, values)
-                for p in range(number):
-                    found[(block + p) // num_proposal_samples, (block + p) % num_proposal_samples] = outputs[0, p]
+        if voxels is not None:
             for r in range(num_rays):
-                near, far = nears[start + r], fars[start + r]
-                light = ONE
-                for s in range(num_proposal_samples):
-                    begin = _distance(np.float32(s) / parts, near, far, is_piecewise)
-                    end = _distance(np.float32(s + 1) / parts, near, far, is_piecewise)
-                    passed = np.exp(-found[r, s] * (end - begin))
-                    weight = light * (ONE - passed)
-                    found[r, s] = weight if weight >= 0 else ZERO  # also where it is no number
-                    light *= passed
-                _resample(found[r], edges[r])
+                _expect(rays, start + r, voxels, field, faint, found)
+                _resample(found, edges[r])
         for r in range(num_rays):
             for s in range(num_samples + 1):
                 edges[r, s] = _distance(edges[r, s], nears[start + r], fars[start + r], is_piecewise)
@@ -302,7 +321,7 @@ def render(
     rays: RayBundle,
     field: EnerfField,
     sampler: PairedSpacedSampler | PairedProposalSampler,
-    proposal: HashDensity | None,
+    expected: DensityVoxels | None,
     faint: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What rays show, without gradients.
@@ -310,9 +329,9 @@ def render(
     Args:
         rays: On the CPU, shape (rays), with nears and fars.
         field: In float32, with two features per level.
-        sampler: How many samples there are along a ray. They are even where there is no proposal network; with
+        sampler: How many samples there are along a ray. They are even where nothing is expected; with
             contraction, up to a distance of 1, and in its inverse from there on.
-        proposal: Whose weights the samples share evenly, or None.
+        expected: Whose weights along a ray the samples share evenly, or None.
         faint: Share of a ray's light that may be missed for what lies behind, and as much for what is thin.
 
     Returns:
@@ -327,9 +346,9 @@ def render(
     rgb = torch.zeros(len(rays), field.num_channels)
     accumulation, depth = torch.zeros(len(rays), 1), torch.zeros(len(rays), 1)
     pictures = (rgb.numpy(), accumulation.numpy(), depth.numpy())
-    where, num_proposal_samples = None, 0
-    if proposal is not None and isinstance(sampler, PairedProposalSampler):
-        where, num_proposal_samples = _made_of(proposal), sampler.num_proposal_samples_per_ray[0]
+    voxels, num_stretches = None, 0
+    if expected is not None and isinstance(sampler, PairedProposalSampler):
+        voxels, num_stretches = expected.values().contiguous().numpy(), sampler.num_proposal_samples_per_ray[0]
         num_samples = sampler.num_nerf_samples_per_ray
     else:
         num_samples = sampler.num_samples
@@ -339,7 +358,7 @@ def render(
     def task(index: int) -> None:
         first, last = TASK * index, min(TASK * (index + 1), len(rays))
         _render(
-            inputs, first, last, where, num_proposal_samples, what, colour, activation, np.float32(faint), num_samples,
+            inputs, first, last, voxels, num_stretches, what, colour, activation, np.float32(faint), num_samples,
             pictures,
         )  # fmt: skip
 

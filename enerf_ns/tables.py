@@ -55,7 +55,7 @@ def choices_table(choices: Sequence[Choice]) -> Table:
     table = Table(title="Parts of the method", caption=f"forced by {prefix}FLAG VALUE, those of event-data at the end")
     table.title_justify = table.caption_justify = "left"
     for column in ("part", "", "what", "why", "flag"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for choice in choices:
         kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
         table.add_row(choice.part, kept, choice.value, choice.why, f"[dim]{choice.flag.removeprefix(prefix)}[/dim]")

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.control import Control
+from rich.markup import escape
+from rich.panel import Panel
 from rich.segment import ControlType
 
 REWRITTEN_EVERY, PRINTED_EVERY = 0.25, 30.0
@@ -44,6 +50,38 @@ def say(sentence: str) -> None:
     """Prints what a person should know, in yellow."""
     clear_line()
     CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
+
+
+def say_where(what: str, where: str) -> None:
+    """Prints a place, or a command, on one line, however long it is, so that it can be copied."""
+    CONSOLE.print(f"[bold]{what}:[/bold] {escape(where)}", soft_wrap=True, highlight=False)
+
+
+CHATTER = (
+    "Mixed precision is disabled",
+    "Saving checkpoints to",
+    "No Nerfstudio checkpoint to load",
+    "[bold yellow]Disabled comet",
+    "disabled local writer",
+)
+"""How lines of Nerfstudio begin that tell a person nothing."""
+
+
+@contextmanager
+def without_chatter() -> Iterator[None]:
+    """Leaves out, in the block, `CHATTER` and the box by which Nerfstudio ends a training, whose paths ours tells."""
+
+    def without(say: Callable[..., None]) -> Callable[..., None]:
+        def said(*objects: Any, **options: Any) -> None:
+            first = objects[0] if objects else None
+            ends = isinstance(first, Panel) and "Training Finished" in str(first.title)
+            if not ends and not (isinstance(first, str) and first.startswith(CHATTER)):
+                say(*objects, **options)
+
+        return said
+
+    with patch.object(CONSOLE, "print", without(CONSOLE.print)), patch.object(CONSOLE, "log", without(CONSOLE.log)):
+        yield
 
 
 def duration(seconds: float) -> str:

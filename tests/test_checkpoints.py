@@ -35,7 +35,11 @@ def test_learning_rates_that_are_numpy_scalars_can_be_loaded(tmp_path: Path, all
     """In a process of its own, since what torch may load is a global of its."""
     file = str(tmp_path / "checkpoint.pt")
     subprocess.run([sys.executable, "-c", SAVE % file], check=True)
-    first = "from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints as allow; allow()" if allowed else "1"
+    first = (
+        "from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints as allow; allow()"
+        if allowed
+        else "1"
+    )
     run = subprocess.run([sys.executable, "-c", LOAD % (first, file)], capture_output=True, text=True)
     assert run.stdout == ("0.01\n" if allowed else "")
     assert allowed or "Unsupported" in run.stderr

@@ -185,7 +185,7 @@ def test_the_change_of_a_pair_is_that_of_its_channel(recording: EventRecording):
     start, end, _ = batch.split(rgb)
     events, sensor = batch.events, pipeline.model.sensor
     predicted = brightness_change(start, end, events, sensor)
-    measured = sensor.measured_change(events.on, events.off, events.pixels)
+    measured = sensor.measured_change(events)
     np.testing.assert_allclose(predicted[events.fired], measured[events.fired], atol=1e-3)
     assert predicted[events.silent].abs().max() < 2 * max(THRESHOLDS)
 

@@ -40,6 +40,26 @@ CONFIGURATIONS = {
     ),
     "uniform samples": ({"model__sampling": "uniform"}, {"event_loss", "distortion_loss"}),
     "view direction": ({"model__view_direction": True}, EVENTS),
+    "level of brightness": ({"model__level_loss_weight": 0.1}, {*EVENTS, "level_loss"}),
+    "a sensor that is learned": (
+        {
+            "data__supervision": "events+frames",
+            "sensor__refractory_period_ns": 1000,
+            **{
+                f"sensor__learn_{part}": True
+                for part in (
+                    "threshold_ratio",
+                    "mean_threshold",
+                    "leak_rate",
+                    "cutoff_frequency",
+                    "response",
+                    "refractory_period",
+                    "threshold_map",
+                )
+            },
+        },
+        {*EVENTS, "frame_loss"},
+    ),
     "colour": ({"model__num_channels": 3}, EVENTS),
     "no distortion loss": ({"model__distortion_loss_weight": 0.0}, {"event_loss", "interlevel_loss"}),
 }

@@ -187,6 +187,30 @@ def test_tools_that_look_at_a_scene_get_pixels_of_the_train_cameras(recording: P
     torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("by", ["downscale_factor", "camera_res_scale_factor"])
+def test_frames_are_learnt_from_downscaled_on_the_rays_of_their_cameras(recording: Path, tmp_path: Path, by: str):
+    config = small_config(recording, tmp_path, data__supervision="frames", data__exposure_samples=1)
+    manager_config = config.pipeline.datamanager
+    if by == "downscale_factor":
+        manager_config.dataparser.downscale_factor = 2.0
+    else:
+        manager_config.camera_res_scale_factor = 0.5
+    manager = set_up(config).pipeline.datamanager
+    cameras = manager.train_dataset.cameras
+    assert manager.frame_colours.shape[1:] == (HEIGHT // 2, WIDTH // 2, 3)
+    assert (cameras.width[0].item(), cameras.height[0].item()) == (WIDTH // 2, HEIGHT // 2)
+    rays, batch = manager.next_train(0)
+    frame, row, column = batch["indices"].T
+    assert row.max() < HEIGHT // 2 and column.max() < WIDTH // 2
+    expected = cameras.generate_rays(frame[:, None], torch.stack([row, column], dim=-1) + 0.5)
+    torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rays.origins, expected.origins, rtol=0, atol=1e-6)
+    data = manager.eval_dataset[0]
+    assert data["image"].shape[:2] == data["depth"].shape[:2] == (HEIGHT // 2, WIDTH // 2)
+    sharp = load_image(manager.eval_dataset.frames.filenames[0])[..., 0] / 255.0
+    assert abs(data["image"].mean().item() - sharp.mean()) < 0.01
+
+
 def test_a_run_that_is_only_looked_at_indexes_no_events(recording: Path, tmp_path: Path, monkeypatch):
     config = small_config(recording, tmp_path).resolved()
     asked = []

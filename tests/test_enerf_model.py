@@ -12,6 +12,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
+from enerf_ns.enerf_model import MEAN_BRIGHTNESS
 from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
@@ -25,6 +26,7 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
         data__supervision="events+frames",
         data__silent_pairs=16,
         model__opacity_loss_weight=0.5,
+        model__level_loss_weight=0.2,
     )
     return set_up(config).pipeline
 
@@ -51,7 +53,7 @@ def test_what_is_rendered_has_the_shapes_that_nerfstudio_asks_for(pipeline: Any)
     with torch.no_grad():
         outputs = pipeline.model(rays)
     assert next(iter(outputs)) == "rgb"
-    sizes = {"rgb": 3, "accumulation": 1, "depth": 1, "normals": 3}
+    sizes = {"rgb": 3, "accumulation": 1, "depth": 1, "normals": 3, "confidence": 1}
     assert {name: tuple(outputs[name].shape) for name in outputs} == {
         name: (len(rays), size) for name, size in sizes.items()
     }
@@ -72,6 +74,8 @@ def test_losses_are_those_of_the_parts(pipeline: Any):
     error = (luma(frames) - luma(batch.frames.colours)) ** 2
     torch.testing.assert_close(losses["frame_loss"], model.config.frame_loss_weight * error.mean())
     torch.testing.assert_close(losses["opacity_loss"], 0.5 * (1 - outputs["accumulation"]).mean())
+    level = torch.exp(torch.log(luma(torch.cat([start, end]))).mean())
+    torch.testing.assert_close(losses["level_loss"], 0.2 * torch.log(level / MEAN_BRIGHTNESS) ** 2)
     psnr = model.get_metrics_dict(outputs, batch)["frame_psnr"]
     torch.testing.assert_close(psnr, -10 * torch.log10(error.mean()))
 
@@ -216,7 +220,7 @@ def test_a_picture_is_the_sum_over_all_samples(recording: Path, tmp_path: Path, 
     else:
         torch.nn.init.normal_(model.proposal.grid.table, std=4.0)
         even = model.sampler.initial_sampler(rays, num_samples=model.config.num_proposal_samples)
-        weights = even.get_weights(model.proposal.density_fn(even.frustums.get_positions()))
+        weights = even.get_weights(model.expected(even.frustums.get_positions()))
         samples = model.sampler.pdf_sampler(rays, even, weights, num_samples=model.config.num_samples)
     field = model.field(samples)
     weights = samples.get_weights(field[FieldHeadNames.DENSITY])

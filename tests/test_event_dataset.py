@@ -16,7 +16,8 @@ from enerf_ns.event_dataset import EventDataset
 
 def dataset(folder: Path, split: str = "train") -> EventDataset:
     config = EventDataParserConfig(data=folder, depth_range=(0.5, 4.0), held_out_every=1)
-    return EventDataset(EventDataParser(config).get_dataparser_outputs(split))
+    parser = EventDataParser(config)
+    return EventDataset(parser.outputs(parser.recording(), split))
 
 
 @pytest.mark.parametrize("channels", [1, 3])

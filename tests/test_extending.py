@@ -51,22 +51,20 @@ def cauchy_loss(predicted: Tensor, measured: Tensor, mean_threshold: float | Ten
     return torch.log1p(((predicted - measured) / mean_threshold) ** 2).mean()
 
 
-class LearnedRatio(SensorModel):
-    """A sensor parameter: the ratio of the contrast thresholds, whose product stays as it is."""
+class LearnedDarkCurrent(SensorModel):
+    """A sensor parameter: the brightness that a pixel sees of darkness."""
 
     def __init__(self, config: SensorModelConfig):
         super().__init__(config)
-        self.log_ratio = nn.Parameter(torch.zeros(()))
+        self.dark_current = nn.Parameter(torch.zeros(()))
 
-    @property
-    def contrast_thresholds(self) -> tuple[float | Tensor, float | Tensor]:
-        on, off = super().contrast_thresholds
-        return on * torch.exp(0.5 * self.log_ratio), off * torch.exp(-0.5 * self.log_ratio)
+    def log_brightness(self, rgb: Tensor, pixels: Tensor) -> Tensor:
+        return super().log_brightness(rgb + self.dark_current, pixels)
 
 
 @dataclasses.dataclass
-class LearnedRatioConfig(SensorModelConfig):
-    _target: type[SensorModel] = dataclasses.field(default_factory=lambda: LearnedRatio)
+class LearnedDarkCurrentConfig(SensorModelConfig):
+    _target: type[SensorModel] = dataclasses.field(default_factory=lambda: LearnedDarkCurrent)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -122,7 +120,7 @@ def test_a_loss_of_ones_own(recording: Path, tmp_path: Path):
     start, end, _ = batch.split(outputs["rgb"])
     sensor, events = pipeline.model.sensor, batch.events
     change = sensor.log_brightness(end, events.pixels) - sensor.log_brightness(start, events.pixels)
-    measured = sensor.measured_change(events.on, events.off, events.pixels)
+    measured = sensor.measured_change(events)
     loss = pipeline.model.get_loss_dict(outputs, batch)["event_loss"]
     torch.testing.assert_close(loss, cauchy_loss(change, measured, sensor.mean_threshold))
 
@@ -130,17 +128,17 @@ def test_a_loss_of_ones_own(recording: Path, tmp_path: Path):
 def test_a_parameter_of_the_sensor(recording: Path, tmp_path: Path):
     """It is trained with a learning rate of its own, stored with the run, and loaded."""
     config = small_config(recording, tmp_path)
-    config.pipeline.model.sensor = LearnedRatioConfig()
+    config.pipeline.model.sensor = LearnedDarkCurrentConfig()
     trainer = two_steps(config)
     sensor = trainer.pipeline.model.sensor
-    assert isinstance(sensor, LearnedRatio) and sensor.log_ratio.item() != 0
+    assert isinstance(sensor, LearnedDarkCurrent) and sensor.dark_current.item() != 0
     assert set(trainer.optimizers.optimizers) == {"fields", "sensor"}
     assert trainer.optimizers.config["sensor"]["optimizer"].lr != trainer.optimizers.config["fields"]["optimizer"].lr
     loaded: Any = eval_setup(trainer.base_dir / "config.yml")[1]
-    torch.testing.assert_close(loaded.model.sensor.log_ratio, sensor.log_ratio, rtol=0, atol=0)
+    torch.testing.assert_close(loaded.model.sensor.dark_current, sensor.dark_current, rtol=0, atol=0)
 
 
 def test_all_three_at_once(two_arrays_folder: Path, tmp_path: Path):
     config = small_config(two_arrays_folder, tmp_path, model__event_loss="cauchy")
-    config.pipeline.model.sensor = LearnedRatioConfig()
+    config.pipeline.model.sensor = LearnedDarkCurrentConfig()
     two_steps(config)

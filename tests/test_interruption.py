@@ -179,7 +179,7 @@ def test_a_longer_run_goes_on_from_the_checkpoints_of_another(recording: Path, t
     longer = trained(config)
     assert checkpoints(first) == ["step-000000001.ckpt"] and checkpoints(longer) == ["step-000000004.ckpt"]
     one, other = (torch.load(trainer.checkpoint_dir / checkpoints(trainer)[0]) for trainer in (first, longer))
-    assert one["max_steps"] == other["max_steps"] == {"fields": 2, "sensor": 2}
+    assert one["max_steps"] == other["max_steps"] and set(one["max_steps"].values()) == {2}
     rates = [state["optimizers"]["fields"]["param_groups"][0]["lr"] for state in (one, other)]
     assert rates[0] == rates[1] == pytest.approx(0.1 * config.optimizers["fields"]["optimizer"].lr)
     assert {int(state["step"]) for state in other["optimizers"]["fields"]["state"].values()} == {5}

@@ -27,6 +27,16 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "data__pair_mode": "successor",
         "sensor__refractory_period_ns": 1000,
     },
+    "a sensor of which all is learned": {
+        "data__silent_pairs": 32,
+        "model__level_loss_weight": 0.1,
+        "sensor__learn_threshold_ratio": True,
+        "sensor__learn_threshold_map": True,
+        "sensor__learn_leak_rate": True,
+        "sensor__learn_cutoff_frequency": True,
+        "sensor__refractory_period_ns": 1000,
+        "sensor__learn_refractory_period": True,
+    },
     "accumulated events": {
         "data__pair_mode": "accumulated",
         "data__silent_pairs": 32,

@@ -30,7 +30,7 @@ WITHOUT_NERFSTUDIO = [
     for module in MODULES
     if module.startswith(("enerf_ns.encodings", "enerf_ns.simulator", "enerf_ns.dataparsers"))
     and module != "enerf_ns.dataparsers.event_dataparser"
-] + ["enerf_ns.events.samplers", "enerf_ns.sensor.response", "enerf_ns.supervision.losses", "enerf_ns.ffmpeg"]
+] + ["enerf_ns.events.samplers", "enerf_ns.sensor.response", "enerf_ns.supervision.losses"]
 
 
 def run_python(code: str, python: str | Path = sys.executable) -> str:
@@ -113,3 +113,15 @@ for point in distribution("enerf-ns").entry_points:
     assert (packages / "enerf_ns" / "report" / "report.html").is_file()
     enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / ".git").exists() or shutil.which("git") is None, reason="no repository of git")
+def test_pip_installs_the_repository_without_a_clone(tmp_path):
+    assert 'pip install -c constraints.txt "git+file://$PWD"' in (ROOT / "README.md").read_text()
+    alone = ["--no-deps", "--no-build-isolation", "--target", tmp_path]
+    subprocess.run([sys.executable, "-m", "pip", "install", *alone, f"git+file://{ROOT}"], check=True)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, tmp_path / "bin/enerf", "check-numerics", "--help"]
+    checked = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert checked.returncode == 0 and "check-numerics" in checked.stdout, checked.stderr

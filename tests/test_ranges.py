@@ -45,6 +45,8 @@ class Setting:
     integer: bool
     several: int | None
     """How many; None: a single one. 1 stands for any number of them."""
+    fixed: bool = False
+    """Whether no flag sets it, though it is no less a part of the config."""
 
     def __str__(self) -> str:
         return ".".join(self.path)
@@ -71,14 +73,19 @@ class Setting:
     def flag(self) -> str:
         """How a message is to name it."""
         dotted = str(self)
-        if dotted.startswith(
-            ("pipeline.defaults.", "pipeline.datamanager.pixel_sampler.", "pipeline.model.sensor.width")
+        if self.name in ("collider_params", "gradient_accumulation_steps"):
+            dotted = dotted.rpartition(".")[0]
+        if self.fixed or dotted.startswith(
+            (
+                "pipeline.defaults.",
+                "pipeline.datamanager.pixel_sampler.",
+                "pipeline.model.sensor.width",
+                "pipeline.model.sensor.height",
+            )
         ):
             return dotted  # which no flag sets
         if dotted.startswith("pipeline.datamanager.dataparser."):
             return "event-data --" + self.path[-1].replace("_", "-")
-        if self.name in ("collider_params", "gradient_accumulation_steps"):
-            dotted = dotted.rpartition(".")[0]
         return "--" + dotted.replace("model.sensor.", "model.").replace("_", "-")
 
 
@@ -95,21 +102,22 @@ def numbers(kind: Any) -> tuple[type, int | None] | None:
     return None
 
 
-def settings(config: Any, path: tuple[str, ...] = (), name: str = "") -> Iterator[Setting]:
+def settings(config: Any, path: tuple[str, ...] = (), name: str = "", fixed: bool = False) -> Iterator[Setting]:
     """All that may hold numbers, by the annotations of the fields."""
     if isinstance(config, dict):
         for key, value in config.items():
             if isinstance(value, int | float):
-                yield Setting((*path, key), name, isinstance(value, int), None)
+                yield Setting((*path, key), name, isinstance(value, int), None, fixed)
             else:
-                yield from settings(value, (*path, key), name)
+                yield from settings(value, (*path, key), name, fixed)
     elif is_dataclass(config) and not isinstance(config, type):
         hints = typing.get_type_hints(type(config), include_extras=True)
         for field in fields(config):
+            is_fixed = fixed or tyro.conf.Fixed in typing.get_args(hints[field.name])
             if found := numbers(hints[field.name]):
-                yield Setting((*path, field.name), field.name, found[0] is int, found[1])
+                yield Setting((*path, field.name), field.name, found[0] is int, found[1], is_fixed)
             else:
-                yield from settings(getattr(config, field.name), (*path, field.name), field.name)
+                yield from settings(getattr(config, field.name), (*path, field.name), field.name, is_fixed)
 
 
 def all_settings() -> list[Setting]:

@@ -153,18 +153,30 @@ def test_rays_start_at_the_near_plane_and_end_at_the_box(training: bool):
     assert (rays.fars > rays.nears).all() and rays.fars.isfinite().all()
 
 
+def test_rays_that_say_where_they_end_do_so_within_the_box():
+    collider = BoxCollider(SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3])), near_plane=0.25)
+    origins = torch.tensor([[0.0, 0.0, -3.0]]).repeat(4, 1)
+    rays = RayBundle(origins, torch.tensor([[0.0, 0.0, 1.0]]).repeat(4, 1), torch.ones(4, 1))
+    rays.nears = torch.tensor([[2.5], [0.0], [1e10], [3.0]])
+    rays.fars = torch.tensor([[3.5], [9.0], [1e10], [3.0]])
+    rays = collider(rays)
+    assert rays.nears is not None and rays.fars is not None
+    torch.testing.assert_close(rays.nears, torch.tensor([[2.5], [2.0], [4.0], [3.0]]))
+    torch.testing.assert_close(rays.fars, torch.tensor([[3.5], [4.0], [4.0], [3.0]]), atol=2e-4, rtol=0)
+
+
 @pytest.mark.parametrize("pairs", [0, PAIRS])
 def test_the_proposal_network_is_asked_along_one_ray_of_a_pair(pairs: int):
     """And says the same of both, as far as they go through the same space; else as Nerfstudio's sampler."""
     rays = replace(paired_rays(), num_pairs=pairs)
     asked = []
 
-    def proposal(positions: Tensor) -> tuple[Tensor, Tensor]:
+    def proposal(positions: Tensor) -> Tensor:
         asked.append(positions.shape[:-1])
-        return density(positions), positions[..., :0]
+        return density(positions)
 
     torch.manual_seed(1)
-    sampler = PairedProposalSampler(12, 8, PairedUniformSampler(single_jitter=True), faint=0.0).train()
+    sampler = PairedProposalSampler(12, 8, PairedUniformSampler(single_jitter=True)).train()
     samples, (weights,), _ = sampler(rays, density_fns=[proposal])
     assert asked == [(len(rays) - pairs, 12)]
     torch.manual_seed(1)
@@ -173,22 +185,12 @@ def test_the_proposal_network_is_asked_along_one_ray_of_a_pair(pairs: int):
     assert weights.shape == (len(rays), 12, 1)
 
 
-def test_behind_what_is_opaque_the_proposal_network_is_not_asked_in_pictures():
+def test_pictures_are_sampled_as_by_nerfstudio_and_are_no_steps():
     rays = paired_rays()
-    asked = 0
-
-    def wall(positions: Tensor) -> Tensor:
-        return 1e3 * (positions.norm(dim=-1, keepdim=True) > 0.5)
-
-    def proposal(positions: Tensor) -> tuple[Tensor, Tensor]:
-        nonlocal asked
-        asked += positions.shape[:-1].numel()
-        return wall(positions), positions[..., :0]
-
-    initial, pdf = PairedUniformSampler().eval(), PairedPDFSampler().eval()
-    sampler = PairedProposalSampler(64, 8, initial, faint=1e-3).eval()
-    samples, (weights,), (even,) = sampler(rays, density_fns=[proposal])
-    expected = even.get_weights(wall(even.frustums.get_positions()))
-    torch.testing.assert_close(weights, expected, rtol=0, atol=1e-3)
-    torch.testing.assert_close(samples.frustums.starts, pdf(rays, even, expected, 8).frustums.starts)
-    assert asked < 0.5 * 64 * len(rays)
+    sampler = PairedProposalSampler(12, 8, PairedUniformSampler()).eval()
+    sampler._steps_since_update = 7
+    samples, (weights,), (even,) = sampler(rays, density_fns=[density])
+    expected = proposal_samples(rays, single_jitter=False, training=False, paired=False)
+    torch.testing.assert_close(samples.frustums.starts, expected.frustums.starts)
+    torch.testing.assert_close(weights, even.get_weights(density(even.frustums.get_positions())))
+    assert sampler._steps_since_update == 7

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from enerf_ns.bench import published
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS, Published
 from enerf_ns.paper_selections import SPIRAL_1
 from enerf_ns.published_losses import PUBLISHED_LOSSES
 
+if TYPE_CHECKING:
+    from enerf_ns.simulator.event_sensor import SensorSettings
+
 PARSER, DATA, MODEL = "pipeline.datamanager.dataparser.", "pipeline.datamanager.", "pipeline.model."
+SENSOR = MODEL + "sensor."
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class Row:
     """Method of ns-train. None: that of the bench."""
     reconstruction: Literal["e2vid", "filter"] | None = None
     """What reconstructs, from events alone, the frames that are learnt from; None: they are the recording's own."""
+    known_sensor: bool = False
+    """Whether it is told what the sequence simulates of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,8 @@ class Sequence:
     """As of `Row`."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
     """Further settings of the simulation."""
+    sensor: Mapping[str, Any] | None = None
+    """Settings of the simulated sensor, of which the recording then states nothing. None: ideal, and stated."""
     files: Mapping[str, str] = field(default_factory=dict)
     """Text by the names of the files that scene and key_frames name."""
 
@@ -122,6 +130,35 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
 }
 """What leaves each of them out; in place of the proposal network are 64 even samples."""
 
+NOTHING_LEARNED: dict[str, Any] = {
+    SENSOR + f"learn_{part}": False
+    for part in ("threshold_ratio", "mean_threshold", "threshold_map", "leak_rate", "cutoff_frequency")
+}
+
+FIXED_SENSOR: dict[str, Any] = {
+    SENSOR + "contrast_thresholds": (0.25, 0.25),
+    SENSOR + "response": "linlog",
+    SENSOR + "refractory_period_ns": 0,
+    **NOTHING_LEARNED,
+    DATA + "max_pair_distance": 10,
+    MODEL + "level_loss_weight": 0.0,
+}
+"""Takes a sensor of which nothing is known for an ideal one, and learns nothing of it, nor holds the level of
+brightness."""
+
+
+def known_sensor(sensor: SensorSettings) -> dict[str, Any]:
+    """What states a simulated sensor, as far as the method has settings for it."""
+    return {
+        SENSOR + "contrast_thresholds": tuple(sensor.contrast_thresholds),
+        SENSOR + "response": sensor.response,
+        SENSOR + "refractory_period_ns": sensor.refractory_period,
+        SENSOR + "leak_rate": sensor.leak_rate,
+        SENSOR + "cutoff_frequency": sensor.cutoff_frequency or None,
+        **NOTHING_LEARNED,
+    }
+
+
 ROWS: dict[str, Row] = {
     "nerf-sharp": Row({**FRAMES, **SHARP}),
     "nerf-blurred": Row({**FRAMES, **ONE_INSTANT}),
@@ -154,12 +191,23 @@ ROWS: dict[str, Row] = {
     "no-distortion-loss": Row({MODEL + "distortion_loss_weight": 0.0}),
     "view-direction": Row({MODEL + "view_direction": True}),
     "16-levels-2^19": Row({MODEL + "num_levels": 16, MODEL + "log2_table_size": 19}),
+    **{f"{number}-samples": Row({MODEL + "num_samples": number}) for number in (16, 32)},
+    **{f"{number}-proposal-samples": Row({MODEL + "num_proposal_samples": number}) for number in (32, 64)},
+    **{
+        f"{number}-pairs": Row({DATA + "event_pairs": number, DATA + "silent_pairs": number // 3})
+        for number in (512, 2048)
+    },
+    **{f"pairs-up-to-{number}-events": Row({DATA + "max_pair_distance": number}) for number in (5, 30)},
+    "16-levels": Row({MODEL + "num_levels": 16}),
     "contraction": Row({MODEL + "contraction": True}),
     "no-contraction": Row({MODEL + "contraction": False}),
     **{name: Row(method=name) for name in PUBLISHED_LOSSES},
     "everything-forced-on": Row(FORCED_ON),
     **{f"without-{part}": Row({**FORCED_ON, **off}) for part, off in LEFT_OUT.items()},
     "everything-left-out": Row({name: value for off in LEFT_OUT.values() for name, value in off.items()}),
+    "fixed": Row(FIXED_SENSOR),
+    "learned": Row(),
+    "known": Row(known_sensor=True),
 }
 """Rows by name; two experiments that have one of the same name share its runs."""
 
@@ -182,6 +230,41 @@ UNBOUNDED_PATH = "0 -0.25 0 0 0 2 0\n0.25 -0.08 0 0.06 0 2 0\n0.5 0.1 0 -0.05 0 
 
 FIVE = ("spiral1", "spiral2", "shake-moon1", "shake-moon2", "shake-carpet1")
 
+SENSORS: dict[str, Sequence] = {
+    "ideal": Sequence("shapes", sensor={"contrast_thresholds": (0.2, 0.2)}),
+    "ratio": Sequence("shapes", sensor={"contrast_thresholds": (0.28, 0.2)}),
+    "spread": Sequence("shapes", sensor={"threshold_spread": 0.06}),
+    "leak": Sequence("shapes", sensor={"leak_rate": 1.0}),
+    "shot-noise": Sequence("shapes", sensor={"shot_noise_rate": 5.0}),
+    "bandwidth": Sequence("shapes", sensor={"cutoff_frequency": 100.0}),
+    "jitter": Sequence("shapes", sensor={"timestamp_jitter": 500_000.0}),
+    "medium": Sequence(
+        "shapes", simulation={"duration": 4.0}, sensor={"threshold_spread": 0.03, "refractory_period": 8_000_000}
+    ),
+    "hard": Sequence(
+        "shapes", simulation={"duration": 4.0}, sensor={"threshold_spread": 0.06, "refractory_period": 25_000_000}
+    ),
+    "faults": Sequence(
+        "shapes",
+        sensor={"contrast_thresholds": (0.28, 0.2), "threshold_spread": 0.06, "refractory_period": 8_000_000},
+    ),
+    "all-faults": Sequence(
+        "shapes",
+        simulation={"duration": 2.0},
+        sensor={
+            "contrast_thresholds": (0.28, 0.2),
+            "threshold_spread": 0.06,
+            "refractory_period": 8_000_000,
+            "leak_rate": 0.5,
+            "shot_noise_rate": 2.0,
+            "cutoff_frequency": 200.0,
+            "timestamp_jitter": 200_000.0,
+        },
+    ),
+}
+"""One recording for each fault of a sensor, then several together: medium and hard are the spreads and refractory
+periods of Robust e-NeRF (Low and Lee, ICCV 2023)."""
+
 SEQUENCES: dict[str, Sequence] = {
     **{name: Sequence(name, preset=name) for name in FIVE},
     "spiral1-sparse": Sequence("spiral1", preset="spiral1-sparse"),
@@ -198,6 +281,7 @@ SEQUENCES: dict[str, Sequence] = {
         simulation={"key_frames": "unbounded.txt", "num_frames": 29},
         files={"unbounded.json": json.dumps(UNBOUNDED_SCENE), "unbounded.txt": UNBOUNDED_PATH},
     ),
+    **SENSORS,
     "recording": Sequence(),
     "slider_depth": Sequence(),
     **{name: Sequence() for name in published.UZH},
@@ -374,6 +458,24 @@ EXPERIMENTS: dict[str, Experiment] = {
         recorded=("recording",),
         columns=("psnr", "ssim", "lpips", "correlation", "depth_rmse"),
     ),
+    "front": Experiment(
+        "What moves error against time: samples, batch, distance of pairs, levels of the hash grid.",
+        (
+            "events",
+            "16-samples",
+            "32-samples",
+            "32-proposal-samples",
+            "64-proposal-samples",
+            "512-pairs",
+            "2048-pairs",
+            "pairs-up-to-5-events",
+            "pairs-up-to-30-events",
+            "16-levels",
+        ),
+        ("shapes",),
+        recorded=("recording",),
+        columns=("psnr", "correlation", "depth_rmse"),
+    ),
     "left-out": Experiment(
         "What the parts would cost that a grey, bounded, rectified scene does not need.",
         (
@@ -398,6 +500,30 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "ssim", "correlation", "near_depth_error"),
         measures=("near_depth",),
         notes=("The depth error is the median, in metres, at things 1 to 2 m away; walls are at 30 and 300 m.",),
+    ),
+    "sensor": Experiment(
+        "An unknown sensor, taken for ideal, learned, and known: each of its faults alone, and together.",
+        ("fixed", "learned", "known"),
+        tuple(SENSORS),
+        columns=(
+            "psnr",
+            "correlation",
+            "depth_rmse",
+            "brightness_scale",
+            "threshold_ratio",
+            "refractory_ms",
+            "threshold_map_on",
+            "threshold_map_off",
+        ),
+        measures=("sensor",),
+        notes=(
+            "The recordings state nothing of their sensor. fixed takes both thresholds for 0.25, all pixels for alike "
+            "and never blind, and the response for linlog; learned is told nothing; known is told what was simulated, "
+            "as far as the method has settings for it.",
+            "In brackets is the truth. The scale is the factor by which the brightness fit multiplies contrast, which "
+            "should be the true mean threshold over the one learnt with.",
+            "Maps of thresholds are compared with the true thresholds of the pixels by their correlation.",
+        ),
     ),
 }
 """Experiments by name."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import statistics
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,13 +18,18 @@ from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import NotScored, mean_scores
-from enerf_ns.evaluation.views import HeldOutView, held_out_views
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, expected_brightness_scale, held_out_views
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.memory import kept_bytes
+from enerf_ns.sensor.sensor_model import SensorModel
+from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.stopwatch import seconds_of
 
 REPEATS = 9
 """How often each part of a step is timed; what is told is the median."""
+
+TRUTH = "truth.json"
+"""What was simulated, in a recording that states nothing of its sensor."""
 
 ProtocolScores = dict[str, dict[str, float]]
 """Scores by protocol."""
@@ -113,6 +121,45 @@ def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     return shares | {"forward_and_backward": 100.0 - sum(shares.values())}
 
 
+def _sensor(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """What the run has for the parameters of the sensor, with the true ones as true_NAME; the brightness scale, with
+    what it should be; and the correlation of its threshold map with the thresholds of the pixels."""
+    sensor, recording = run.pipeline.model.sensor, run.config.data
+    assert recording is not None
+    simulated = SensorSettings(**json.loads((recording / TRUTH).read_text())["sensor"])
+    on, off = (float(torch.as_tensor(threshold).mean()) for threshold in sensor.contrast_thresholds)
+    found = {
+        "contrast_threshold_on": on,
+        "contrast_threshold_off": off,
+        "threshold_ratio": on / off,
+        "refractory_ms": 1e-6 * float(sensor.refractory_period),
+    }
+    found |= {"leak_rate": float(sensor.leak_rate), "cutoff_frequency": sensor.cutoff_frequency}
+    true_on, true_off = simulated.contrast_thresholds
+    truth = {
+        "contrast_threshold_on": true_on,
+        "contrast_threshold_off": true_off,
+        "threshold_ratio": true_on / true_off,
+        "refractory_ms": 1e-6 * simulated.refractory_period,
+        "leak_rate": simulated.leak_rate,
+        "cutoff_frequency": simulated.cutoff_frequency or math.inf,
+    }
+    scale = aligned_views(views)[1].get("brightness_scale")
+    if scale is not None:
+        found["brightness_scale"] = scale
+        truth["brightness_scale"] = expected_brightness_scale(simulated.contrast_thresholds, sensor)
+    return found | _map_correlation(sensor, recording) | {f"true_{name}": truth[name] for name in found}
+
+
+def _map_correlation(sensor: SensorModel, recording: Path) -> dict[str, float]:
+    """Over pixels, of each polarity; nothing where the sensor has no map, or the recording's pixels are alike."""
+    thresholds, found = recording / "thresholds.npy", sensor.threshold_map
+    if found is None or not thresholds.exists():
+        return {}
+    pairs = zip(("on", "off"), found.deviations.T.cpu().numpy(), np.load(thresholds), strict=True)
+    return {f"threshold_map_{name}": float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) for name, a, b in pairs if a.std()}
+
+
 def milliseconds_a_step(run: Run) -> float:
     """Of the training of a run."""
     assert run.train_seconds is not None
@@ -129,5 +176,6 @@ MEASURES: dict[str, Callable[[Run, Sequence[HeldOutView]], dict[str, float]]] = 
     "near_depth": _near_depth,
     "memory": _memory,
     "step": _step,
+    "sensor": _sensor,
 }
 """What is told beside scores, by name."""

@@ -16,23 +16,26 @@ from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
 from statistics import median
-from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Any
 
 import numba
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 import enerf_ns
-from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment
-from enerf_ns.bench.measures import evaluate
+from enerf_ns.bench.diagram import diagram
+from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
+from enerf_ns.bench.measures import TRUTH, evaluate
+from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.bench.tables import csv_table, markdown
 from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.files import read_json, write_whole
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.evaluation.lpips import NETWORKS, Net
 from enerf_ns.evaluation.runs import method_config, set_up, train
 from enerf_ns.numerics.parts import error_of_parts
 from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.stopwatch import seconds_of
 
@@ -45,34 +48,11 @@ WARM_UP, TIMED = 5, 20
 LATE = 1001
 """Number of the first of them: as a run goes on, the proposal network learns at some steps only."""
 
+STATED_OF_SENSOR = ("contrast_thresholds", "refractory_period_ns", "response", "sensor")
+"""What recording.json and simulation.json hold of a sensor, but for its colour filter."""
+
 RESULT, LOG = "result.json", "log.txt"
 """What a run's folder has besides the run itself."""
-
-
-@dataclass(frozen=True)
-class BenchSettings:
-    """What is run, and for how long."""
-
-    data: Optional[Path] = None  # noqa: UP045
-    """Recording, or folder of recordings, of an experiment on real ones."""
-    budget: str = "120s"
-    """Training of each row: seconds, as in 120s, or steps, as in 600."""
-    scale: float = 0.25
-    """Size of the simulated sequences, of 640 x 480."""
-    seeds: int = 1
-    """Trainings of each row; scores are their means, with standard deviations."""
-    sequences: Tuple[str, ...] = ()  # noqa: UP006
-    """Some of the experiment's sequences. None: all."""
-    rows: Tuple[str, ...] = ()  # noqa: UP006
-    """Some of the experiment's rows. None: all."""
-    method: str = "enerf"
-    """Method of ns-train: enerf, or enerf-paper at full size on a GPU."""
-    reconstruction_weights: Optional[Path] = None  # noqa: UP045
-    """Weights of E2VID or FireNet, by which frames are reconstructed from events; without, that row is left out."""
-    threads: Optional[int] = None  # noqa: UP045
-    """Threads of the processor. None: as many as it has cores."""
-    output_dir: Path = Path("outputs/bench")
-    """Folder for the tables, recordings and runs; what is finished there is not run again."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +146,9 @@ class Bench:
             }.items():
                 self._write(self.output_dir / f"{self.name}.{suffix}", content)
             yield cell, result
+        picture = diagram(self.results(runs))
+        if picture is not None:
+            self._write(self.output_dir / f"{self.name}.png", picture)
 
     def results(self, runs: list[dict[str, Any]]) -> dict[str, Any]:
         """What is told of the experiment: all that its table is made of."""
@@ -215,7 +198,14 @@ class Bench:
         if sequence.scene is None:
             return None
         width, height = (max(1, round(self.settings.scale * side)) for side in FULL_SIZE)
-        return {"scene": sequence.scene, "width": width, "height": height, **sequence.simulation}
+        sensor = {} if sequence.sensor is None else {"sensor": dict(sequence.sensor)}
+        return {"scene": sequence.scene, "width": width, "height": height, **sequence.simulation, **sensor}
+
+    def _changes(self, cell: Cell) -> dict[str, Any]:
+        """What a cell changes of the method."""
+        row, sequence = ROWS[cell.row], SEQUENCES[cell.sequence]
+        known = known_sensor(SensorSettings(**(sequence.sensor or {}))) if row.known_sensor else {}
+        return {**sequence.changes, **row.changes, **known, "machine.seed": cell.seed}
 
     def _about(self, cell: Cell) -> dict[str, Any]:
         """All that a result depends on, but for the version of the code."""
@@ -224,7 +214,7 @@ class Bench:
         weights = settings.reconstruction_weights if row.reconstruction == "e2vid" else None
         about = {
             "method": self._method(cell),
-            "changes": {**sequence.changes, **row.changes, "machine.seed": cell.seed},
+            "changes": self._changes(cell),
             "factors": row.factors,
             "preset": sequence.preset,
             "recording": str(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
@@ -292,7 +282,7 @@ class Bench:
 
     def _config(self, cell: Cell, folder: Path) -> EnerfTrainerConfig:
         row, sequence = ROWS[cell.row], SEQUENCES[cell.sequence]
-        changes = {**sequence.changes, **row.changes, "machine.seed": cell.seed, "preset": sequence.preset}
+        changes = {**self._changes(cell), "preset": sequence.preset}
         config = method_config(self._method(cell), self._recording(cell), self.output_dir / "runs", changes)
         config.experiment_name, config.timestamp = cell.sequence, folder.name
         if sequence.scene is not None and config.pipeline.model.view_direction is None:
@@ -326,12 +316,17 @@ class Bench:
             with _made_whole(recording) as folder:
                 if folder is not None:
                     given: dict[str, Any] = {
-                        name: str(self._file(value, sequence.files[value])) if value in sequence.files else value
+                        name: str(self._file(value, sequence.files[value]))
+                        if isinstance(value, str) and value in sequence.files
+                        else value
                         for name, value in simulation.items()
                     }
                     if "key_frames" in given:
                         given["key_frames"] = Path(given["key_frames"])
+                    given["sensor"] = SensorSettings(**(sequence.sensor or {}))
                     simulate(SimulationSettings(**given), folder)
+                    if sequence.sensor is not None:
+                        hide_sensor(folder)
         if row.reconstruction is None:
             return recording
         from enerf_ns.reconstruction.reconstruction import reconstruct
@@ -350,7 +345,7 @@ class Bench:
         self._write(path, content)
         return path
 
-    def _write(self, path: Path, content: str) -> None:
+    def _write(self, path: Path, content: str | bytes) -> None:
         try:
             write_whole(path, content)
         except OSError as error:
@@ -391,6 +386,17 @@ def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
         # a pair of steps, of which the proposal network learns at one; the median, which a hiccup does not move
         pairs = [sum(pair) for pair in zip(times[WARM_UP::2], times[WARM_UP + 1 :: 2], strict=True)]
         return max(1, round(amount / (0.5 * median(pairs))))
+
+
+def hide_sensor(recording: Path) -> None:
+    """Takes what a simulated recording states of its sensor, but for a colour filter, out of its files, and leaves all
+    settings of the simulation in `TRUTH`, which no reader knows."""
+    write_whole(recording / TRUTH, (recording / "simulation.json").read_bytes())
+    for name in ("simulation.json", "recording.json"):
+        if (recording / name).exists():
+            stated = read_json(recording / name)
+            kept = {name: value for name, value in stated.items() if name not in STATED_OF_SENSOR}
+            write_whole(recording / name, json.dumps(kept, indent=2) + "\n")
 
 
 def code_version() -> str:

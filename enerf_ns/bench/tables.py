@@ -24,6 +24,7 @@ DIGITS = {
     "depth_rmse_all_poses": 2,
     "ms_a_step": 0,
     "megabytes_a_step": 1,
+    "refractory_ms": 2,
     **dict.fromkeys(("sample", "poses", "rays", "images", "forward_and_backward"), 2),
 }
 """Digits behind the point, where they are not 3."""
@@ -39,6 +40,11 @@ TITLES = {
     "ms_a_step": "ms a step",
     "megabytes_a_step": "MB a step",
     "forward_and_backward": "forward and backward",
+    "brightness_scale": "scale",
+    "threshold_ratio": "C_on / C_off",
+    "refractory_ms": "blind, ms",
+    "threshold_map_on": "map of C_on",
+    "threshold_map_off": "map of C_off",
 }
 """Names of scores for a reader, where they are not their own."""
 
@@ -109,7 +115,7 @@ def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
     content = []
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
-        cells += [_score(name, line.scores.get(name, [])) for name in columns]
+        cells += [_score(name, line.scores.get(name, [])) + _truth(name, line) for name in columns]
         cells += [f"{mean(line.seconds):.0f}" if line.seconds else "-"]
         cells += [f"{mean(line.steps):.0f}" if line.steps else "-"]
         cells += [_published(name, line.published[name]) if name in line.published else "-" for name in theirs]
@@ -127,6 +133,12 @@ def _score(name: str, values: list[float]) -> str:
     digits = DIGITS.get(name, 3)
     spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{mean(values):.{digits}f}{spread}"
+
+
+def _truth(name: str, line: Line) -> str:
+    """What a score should be, where that is known."""
+    values = line.scores.get(f"true_{name}")
+    return f" ({_score(name, [mean(values)])})" if values else ""
 
 
 def _published(name: str, value: float) -> str:

@@ -76,6 +76,10 @@ def event_scores(
     return scores
 
 
+KNOWN = 0.5
+"""Confidence from which rendered depth counts as known."""
+
+
 def depth_rmse(rendered: Float[Tensor, "height width 1"], recorded: Float[Tensor, "height width 1"]) -> Score:
     """Root mean squared error of depth in metres, over the pixels whose recorded depth is known."""
     known = is_known(recorded)

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from enerf_ns.evaluation.lpips import NETWORKS, Net, lpips
-from enerf_ns.evaluation.metrics import Score, correlation, depth_rmse, is_known, psnr, ssim
+from enerf_ns.evaluation.metrics import KNOWN, Score, correlation, depth_rmse, is_known, psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS
-from enerf_ns.evaluation.views import HeldOutView, aligned_views
+from enerf_ns.evaluation.views import EXPECTED_SCALE, HeldOutView, aligned_views
 
 NotScored = dict[str, dict[str, list[int]]]
 """What has no value: by score and reason, the numbers of the held-out frames, from 0; none of a score of the whole
@@ -29,7 +29,9 @@ def view_scores(
 
     Returns:
         psnr (dB), ssim, correlation, lpips (AlexNet) and lpips_vgg, those that are asked for, and of a recording with
-        depth depth_rmse (metres). The correlation is that of the render as it is, before brightness is aligned.
+        depth depth_rmse (metres); where the view says how far its depth is known, also depth_known, the share of pixels
+        whose depth is, depth_rmse_known over these, and depth_rmse_spread of the spread depth over all (metres). The
+        correlation is that of the render as it is, before brightness is aligned.
     """
     names = ["psnr", "ssim", *(NETWORKS[net].score for net in lpips_nets)]
     if view.recorded is None or aligned.recorded is None:
@@ -46,6 +48,14 @@ def view_scores(
     scores["correlation"] = correlation(view.rendered, view.recorded)
     if view.recorded_depth is not None:
         scores["depth_rmse"] = depth_rmse(view.depth, view.recorded_depth)
+    if view.recorded_depth is not None and view.confidence is not None and view.spread_depth is not None:
+        known, truth = view.confidence >= KNOWN, is_known(view.recorded_depth)
+        found = depth_rmse(view.depth, view.recorded_depth.where(known, 0.0))
+        scores["depth_rmse_known"] = (
+            "no rendered depth is known" if truth.any() and not (truth & known).any() else found
+        )
+        scores["depth_known"] = float(known[truth].float().mean()) if truth.any() else "no depth is known"
+        scores["depth_rmse_spread"] = depth_rmse(view.spread_depth, view.recorded_depth)
     return scores
 
 
@@ -118,9 +128,11 @@ def summary_scores(
 
     Returns:
         protocol, the name; psnr (dB), ssim, lpips, correlation, and with known depth depth_rmse and mean_depth
-        (metres); means over the held-out frames that have them; the parameters of the protocol's fit over the whole
-        set. psnr, ssim and what was asked of LPIPS are None where no frame has them; without frames, event_correlation
-        stands for them, and the protocol is "events". not_scored, where anything is left out, says what and why.
+        (metres), and what else `view_scores` has of depth; means over the held-out frames that have them; the
+        parameters of the protocol's fit over the whole set, with brightness_scale_expected only beside that of
+        log-affine-set, of which it is. psnr, ssim and what was asked of LPIPS are None where no
+        frame has them; without frames, event_correlation stands for them, and the protocol is "events". not_scored,
+        where anything is left out, says what and why.
 
     Raises:
         FlagError: The crop is larger than the frames.
@@ -137,6 +149,8 @@ def summary_scores(
     if means_of_depth:
         scores["mean_depth"] = float(np.mean(means_of_depth))
     for name, value in summary.items():
+        if name == EXPECTED_SCALE and not (parameters and protocol == DEFAULT_PROTOCOL):
+            continue
         if isinstance(value, str):
             not_scored[name] = {value: []}
         else:

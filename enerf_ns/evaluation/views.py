@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from rich.progress import track
@@ -24,6 +25,12 @@ from enerf_ns.enerf_model import EnerfModel
 from enerf_ns.evaluation.held_out_poses import held_out_numbers
 from enerf_ns.evaluation.metrics import Score, is_known
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
+from enerf_ns.sensor.response import Gamma
+from enerf_ns.sensor.sensor_model import SensorModel
+from enerf_ns.spread_depth import depth_evidence
+
+EXPECTED_SCALE = "brightness_scale_expected"
+"""Name of what the brightness_scale of log-affine-set should be."""
 
 
 class RenderingPipeline(Protocol):
@@ -62,6 +69,11 @@ class HeldOutView:
     """Whether the sensor has a colour filter, so that events leave the brightness of each channel open by itself."""
     not_aligned: str | None = None
     """Of `aligned_views`, why the brightness of the render, which should be aligned, is not; None where it is."""
+    confidence: Tensor | None = None
+    """How far the rendered depth is known, from 0 to 1, one channel; None where that was not asked for."""
+    spread_depth: Tensor | None = None
+    """Rendered depth in metres along the optical axis, spread from where it is known (`enerf_ns.spread_depth`), one
+    channel; None where the confidence is."""
 
     def cropped(self, height: int, width: int) -> HeldOutView:
         """The middle of the view.
@@ -80,8 +92,8 @@ class HeldOutView:
         def cut(picture: Tensor | None) -> Any:
             return picture if picture is None else picture[top : top + height, left : left + width]
 
-        pictures = {name: cut(getattr(self, name)) for name in ("recorded", "rendered", "depth", "recorded_depth")}
-        return replace(self, **pictures)
+        names = ("recorded", "rendered", "depth", "recorded_depth", "confidence", "spread_depth")
+        return replace(self, **{name: cut(getattr(self, name)) for name in names})
 
     @property
     def median_depth(self) -> float:
@@ -106,13 +118,7 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
     """
     manager = pipeline.datamanager
     dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
-    data = dataset[number]
-    camera = dataset.cameras[number : number + 1].to(pipeline.device)
-    if reduced_by > 1:
-        size = camera.height // reduced_by, camera.width // reduced_by
-        camera.rescale_output_resolution(1.0 / reduced_by)
-        camera.height, camera.width = size
-    rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+    data, rays = dataset[number], _rays(pipeline, number, reduced_by)
     outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
     z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
     depth = data.get("depth")
@@ -128,6 +134,23 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
     )
 
 
+def _rays(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> RayBundle:
+    """Rays of a held-out frame, shape (height, width), as of `held_out_view`."""
+    camera = pipeline.datamanager.eval_dataset.cameras[number : number + 1].to(pipeline.device)
+    if reduced_by > 1:
+        size = camera.height // reduced_by, camera.width // reduced_by
+        camera.rescale_output_resolution(1.0 / reduced_by)
+        camera.height, camera.width = size
+    return camera.generate_rays(camera_indices=0, keep_shape=True)
+
+
+def _with_evidence(pipeline: RenderingPipeline, view: HeldOutView, number: int, reduced_by: int) -> HeldOutView:
+    """The view with how far its depth is known, and with its depth spread from there."""
+    rays, scale = _rays(pipeline, number, reduced_by), pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    confidence, spread = depth_evidence(pipeline.model, rays, view.depth, view.rendered, scale)
+    return replace(view, confidence=confidence, spread_depth=spread)
+
+
 def _reduced(picture: Tensor, by: int) -> Tensor:
     """Means over squares of pixels of a picture (height, width, channels); rows and columns left over are cut off."""
     return torch.nn.functional.avg_pool2d(picture.movedim(-1, 0), by).movedim(0, -1) if by > 1 else picture
@@ -135,7 +158,7 @@ def _reduced(picture: Tensor, by: int) -> Tensor:
 
 @torch.no_grad()
 def held_out_views(
-    pipeline: RenderingPipeline, numbers: Sequence[int] | None = None, reduced_by: int = 1
+    pipeline: RenderingPipeline, numbers: Sequence[int] | None = None, reduced_by: int = 1, evidence: bool = True
 ) -> tuple[list[HeldOutView], dict[str, Score]]:
     """Render held-out frames.
 
@@ -143,10 +166,12 @@ def held_out_views(
         pipeline: With a trained field.
         numbers: Of the held-out frames, from 0. None: all, with a bar that shows how far it is.
         reduced_by: As of `held_out_view`.
+        evidence: Find out how far depth is known, and spread it from there, which takes longer than rendering.
 
     Returns:
-        The views, and numbers about the whole set: rendering speed, and the `held_out_numbers`; for a recording without
-        frames, the correlation of its events, or why there is none.
+        The views, and numbers about the whole set: rendering speed, and the `held_out_numbers`, and where a run learnt
+        from events whose thresholds the recording states, `EXPECTED_SCALE`, the `expected_brightness_scale`;
+        for a recording without frames, the correlation of its events, or why there is none.
     """
     pipeline.eval()
     manager = pipeline.datamanager
@@ -156,6 +181,8 @@ def held_out_views(
     shown = track(chosen, "Rendering held-out frames", console=CONSOLE, transient=True, disable=numbers is not None)
     views = [held_out_view(pipeline, number, reduced_by) for number in shown]
     seconds = time.perf_counter() - start
+    if evidence:
+        views = [_with_evidence(pipeline, *both, reduced_by) for both in zip(views, chosen, strict=True)]
     summary: dict[str, Score] = {
         "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
         "fps": len(views) / seconds,
@@ -165,8 +192,26 @@ def held_out_views(
     else:
         depths = np.array([view.median_depth for view in views])
         summary |= held_out_numbers(manager, np.array(chosen), depths)
+        thresholds = dataset.recording.contrast_thresholds
+        if thresholds is not None and "events" in manager.config.supervision:
+            summary[EXPECTED_SCALE] = expected_brightness_scale(thresholds, pipeline.model.sensor)
+    summary |= {f"sensor_{name}": value for name, value in pipeline.model.sensor.learned().items()}
     pipeline.train()
     return views, summary
+
+
+def expected_brightness_scale(contrast_thresholds: tuple[float, float], sensor: SensorModel) -> float:
+    """What the scale of the fit of log-affine-set is for a field that explains all events.
+
+    Events count changes of log brightness in thresholds, so that the field has its contrast in those that it learnt
+    with: with too high ones it shows too much, which the fit takes back.
+
+    Args:
+        contrast_thresholds: C_on and C_off of the sensor that made the events.
+        sensor: The one that the field learnt with.
+    """
+    encoding = sensor.response.exponent if isinstance(sensor.response, Gamma) else 1.0
+    return encoding * 0.5 * sum(contrast_thresholds) / float(sensor.mean_threshold)
 
 
 def aligned_views(

@@ -27,6 +27,9 @@ class EventBatch:
     """Number of pairs of silent pixels, whose instants are any between two of their events; they come last."""
     starts_at_events: bool = True
     """Whether the pairs of events begin at events, after which pixels may be blind; windows of time do not."""
+    rates: Float[Tensor, "pairs 2 2"] | None = None
+    """Events a second around the first and the second instant of each pair, on and off (`samplers.rates_around`); None
+    where nobody needs them."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -50,13 +53,15 @@ class EventBatch:
         """A batch of these pairs, all of events, and then those of silent pixels."""
         columns = zip(self.columns, silent.columns, strict=True)
         joined = (torch.cat(both) for both in columns)
-        return EventBatch(*joined, num_silent=len(silent), starts_at_events=self.starts_at_events)
+        rates = None if self.rates is None else torch.cat([self.rates, self.rates.new_zeros(len(silent), 2, 2)])
+        return EventBatch(*joined, num_silent=len(silent), starts_at_events=self.starts_at_events, rates=rates)
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
         num_silent = int(chosen[self.silent].sum())
-        return EventBatch(*columns, num_silent=num_silent, starts_at_events=self.starts_at_events)
+        rates = None if self.rates is None else self.rates[chosen]
+        return EventBatch(*columns, num_silent=num_silent, starts_at_events=self.starts_at_events, rates=rates)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
@@ -91,8 +91,15 @@ class EventPairSampler:
             raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
         self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index."""
+    def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
+        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index.
+
+        Args:
+            batch_size: Pairs.
+            generator: On the device of the index.
+            blind_ns: Where the rates of events around the instants are to be told, for how long a pixel is blind after
+                an event.
+        """
         device = self.index.times.device
         if self._active is None:
             pair = torch.randint(self.num_pairs, (batch_size,), generator=generator, device=device)
@@ -102,8 +109,7 @@ class EventPairSampler:
             begin = self._pair_offsets[pixels]
             pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
         start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
-        on = (self.index.positives[end] - self.index.positives[start]).long()
-        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
+        return _pairs_of(self.index, pixels, start, end, blind_ns)
 
     def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         start = self._starts[pair]
@@ -127,6 +133,52 @@ class EventPairSampler:
     def _event(self, instants: Tensor) -> Tensor:
         """Numbers of the events that are the instants with these numbers, counted over all pixels."""
         return instants + torch.searchsorted(self._before_skipped, instants.int(), right=True)
+
+
+def _pairs_of(index: EventIndex, pixels: Tensor, start: Tensor, end: Tensor, blind_ns: int | None) -> EventBatch:
+    """Pairs of events, given by their numbers in the index; arguments as of `EventPairSampler.sample`."""
+    rates = None
+    if blind_ns is not None:
+        begins = rates_around(index, start, pixels, blind_ns, blind_ns)
+        rates = torch.stack([begins, rates_around(index, end, pixels, 0, blind_ns)], dim=1)
+    on = (index.positives[end] - index.positives[start]).long()
+    return EventBatch(pixels, index.times[start], index.times[end], on, end - start - on, rates=rates)
+
+
+def rates_around(
+    index: EventIndex, events: Int64[Tensor, " pairs"], pixels: Int64[Tensor, " pairs"], delay_ns: int, blind_ns: int
+) -> Float32[Tensor, "pairs 2"]:
+    """Events a second of a pixel, on and off, as its signal changes at, or shortly after, one of its events.
+
+    Each of the two intervals beside the event holds one event; its rate is that of the middle of the time during which
+    the pixel saw. The rate at the instant is interpolated between both middles, so that of a signal with a constant
+    second derivative it is exact. Where the signal turns before the next event, it has nearly come to rest: then it is
+    half of the rate before, but where the pixel was blind, and the next interval tells what it saw since. Where the
+    pixel has no event before or after, the other interval alone tells.
+
+    Args:
+        index: The events.
+        events: Their numbers in the index.
+        pixels: To which they belong.
+        delay_ns: From the event to the instant.
+        blind_ns: For how long a pixel is blind after an event.
+    """
+    times, positives = index.times, index.positives
+    first, last = index.offsets[pixels], index.offsets[pixels + 1] - 1
+    before, after = (events - 1).clamp(min=0), (events + 1).clamp(max=len(times) - 1)
+    left, right = (times[events] - times[before] - blind_ns).clamp(min=1), (times[after] - times[events] - blind_ns)
+    left, right = left.double(), right.clamp(min=1).double()
+    is_on = torch.stack([positives[events] > positives[before], positives[after] > positives[events]], dim=-1)
+    is_on[:, 0] |= (events == 0) & (positives[events] > 0)
+    share = (0.5 * left + delay_ns) / (0.5 * left + blind_ns + 0.5 * right)
+    share = torch.where(events == last, 0.0, torch.where(events == first, 1.0, share.clamp(max=1.0)))
+    of_left, of_right = 1e9 * (1.0 - share) / left, 1e9 * share / right
+    if not blind_ns:
+        turns = (is_on[:, 0] != is_on[:, 1]) & (events > first) & (events < last)
+        of_left, of_right = torch.where(turns, 0.5e9 / left, of_left), torch.where(turns, 0.0, of_right)
+    of_right, of_left = of_right * (events < last), of_left * (events > first)
+    on = of_left * is_on[:, 0] + of_right * is_on[:, 1]
+    return torch.stack([on, of_left + of_right - on], dim=-1).float()
 
 
 class HeldOutPairSampler:
@@ -157,12 +209,11 @@ class HeldOutPairSampler:
         if not len(self._pairs):
             raise ValueError(f"no pixel fired twice, {max_distance} events apart or less, in the time that is held out")
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index."""
+    def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
+        """Draws `batch_size` pairs with replacement; arguments as of `EventPairSampler`."""
         chosen = torch.randint(len(self._pairs), (batch_size,), generator=generator, device=self._pairs.device)
         pixels, start, end = self._pairs[chosen].long().T
-        on = (self.index.positives[end] - self.index.positives[start]).long()
-        return EventBatch(pixels, self.index.times[start], self.index.times[end], on, end - start - on)
+        return _pairs_of(self.index, pixels, start, end, blind_ns)
 
 
 class SilentPixelSampler:
@@ -329,8 +380,8 @@ class AccumulationSampler:
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
         self._of_fired, self._of_any = _Draws(), _Draws()
 
-    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs.
+    def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
+        """Draws `batch_size` pairs; of rates, which belong to events, they tell nothing.
 
         Where events are so rare that `MOST_DRAWS` a pair hold fewer, those found are used again; where they hold none,
         two instants of a pair are one, and it counts no events.

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from enerf_ns.numerics.case import case
 from enerf_ns.sensor.response import Gamma, Linlog, Logarithm, Response
-from enerf_ns.sensor.sensor_model import thresholds_from_polarity
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
 from enerf_ns.supervision.losses import no_event_loss, normalised_event_loss
 
@@ -77,9 +76,3 @@ def silent_at_zero() -> float:
     loss = no_event_loss(predicted, (0.2, 0.3), margin=0.0)
     (gradient,) = torch.autograd.grad(loss, predicted)
     return float(loss) + int((~gradient.isfinite()).sum())
-
-
-@case("events of one polarity, or one among 1e9", "thresholds above 0 whose mean is 0.25", 1e-12)
-def one_polarity() -> float:
-    found = [thresholds_from_polarity(*counts) for counts in ((1000, 0), (0, 1000), (1, 10**9), (10**9, 1))]
-    return max(abs(0.5 * (on + off) - 0.25) if min(on, off) > 0 else math.inf for on, off in found)

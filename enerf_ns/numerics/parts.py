@@ -248,7 +248,7 @@ def _brightness_fit(run: Run) -> list[PartError]:
     """What is left after the brightness fit of the default protocol; nothing where there is none."""
     number = len(run.pipeline.datamanager.eval_dataset)
     chosen = np.unique(np.linspace(0, number - 1, NUM_VIEWS).round().astype(int)).tolist()
-    views, _ = aligned_views(held_out_views(run.pipeline, chosen)[0])
+    views, _ = aligned_views(held_out_views(run.pipeline, chosen, evidence=False)[0])
     errors = [
         (linlog(view.rendered.double()) - linlog(view.recorded.double())).flatten()
         for view in views

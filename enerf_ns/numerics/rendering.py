@@ -106,7 +106,7 @@ def _half_error(dtype: torch.dtype) -> float:
     rays = model.collider(manager.rays(batch, model.sensor))
     model.train()
     with torch.no_grad():
-        samples, _, _ = model.sampler(rays, density_fns=[model.proposal])
+        samples, _, _ = model.sampler(rays, density_fns=[model.proposal.density_fn])
 
         def change() -> Tensor:
             outputs = model.field(samples)

@@ -25,7 +25,7 @@ def exposure_motion(frames: Frames, near: float, far: float) -> Float64[np.ndarr
         frames: Exposed within their trajectory.
         near, far: Range of depth, metres.
     """
-    camera = frames.camera.undistorted()
+    camera = frames.picture_camera
     columns, rows = (np.linspace(0, side - 1, PLACES) for side in (camera.width, camera.height))
     pixels = np.stack([*np.meshgrid(columns, rows), np.ones((PLACES, PLACES))], axis=-1).reshape(-1, 3)
     rays = np.concatenate([depth * pixels @ np.linalg.inv(camera.matrix).T for depth in (near, far)])

@@ -19,10 +19,10 @@ from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.sensor_estimates import ASSUMED_THRESHOLD
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
 from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, reconstruct_frames
 from enerf_ns.reconstruction.networks import load_network
-from enerf_ns.sensor.sensor_model import DEFAULT_CONTRAST_THRESHOLD
 
 DEFAULT_FRAMES_PER_SECOND = 30.0
 """Frames reconstructed per second of a recording that has none."""
@@ -97,7 +97,7 @@ def reconstruct(
             name = f"{network.name} ({weights.name})"
             reconstruction = NetworkReconstruction(network, name, camera.width, camera.height)
         else:
-            thresholds = recording.contrast_thresholds or (DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD)
+            thresholds = recording.contrast_thresholds or (ASSUMED_THRESHOLD, ASSUMED_THRESHOLD)
             size, start = (camera.width, camera.height), recording.span[0]
             reconstruction = ComplementaryFilter(*size, thresholds, cutoff_frequency, start)
         times, numbers = _instants(recording, frames_per_second)

@@ -22,11 +22,17 @@ SCORES = {
     "lpips_vgg": "LPIPS (VGG)",
     "correlation": "correlation",
     "depth_rmse": "depth RMSE, m",
+    "depth_rmse_known": "depth RMSE where known, m",
+    "depth_known": "depth known, share",
+    "depth_rmse_spread": "depth RMSE, spread, m",
     "event_correlation": "event correlation",
     "event_rmse": "event RMSE, thresholds",
     "event_sign": "event sign, share",
 }
 """What is said of each score on an axis, with its unit."""
+
+AT_END = ("depth_rmse_known", "depth_known", "depth_rmse_spread")
+"""Those that only the end of a run has."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, which the colour-blind tell apart."""
@@ -73,7 +79,7 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
     from matplotlib.figure import Figure
 
     drawn = [row for run in runs for row in run.history if getattr(row, axis_of) > 0]
-    left_out = ("event_rmse", "event_sign") if any(row.num_frames for row in drawn) else ()
+    left_out = (*AT_END, *(("event_rmse", "event_sign") if any(row.num_frames for row in drawn) else ()))
     names = [name for name in SCORES if name not in left_out and any(name in row.scores for row in drawn)]
     if not names:
         return None

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
 from enerf_ns.dataparsers.files import in_colour, load_image
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
-from enerf_ns.evaluation.metrics import is_known
-from enerf_ns.evaluation.runs import Run
+from enerf_ns.evaluation.metrics import KNOWN, is_known
 from enerf_ns.evaluation.views import HeldOutView
 
 if TYPE_CHECKING:
@@ -32,6 +27,10 @@ PICTURE_ROWS = 3
 """Number of held-out frames shown in the picture."""
 POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event": NO_EVENT}
 """What the colours of an `event_picture` mean."""
+UNKNOWN = "#c9ced8"
+"""Grey where a value is not known."""
+FAINTEST = 0.15
+"""Opacity of depth that nothing is known of."""
 KEY_POSES = 7
 """Number of held-out cameras that the video flies past."""
 VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
@@ -51,6 +50,8 @@ class Column:
     colours: str = ""
     limits: tuple[float, float] = (0.0, 1.0)
     """Values at the ends of the colours."""
+    opacities: Sequence[np.ndarray] | None = None
+    """Of each picture, from 0, where only the grey behind it is seen, to 1 (height, width). None: 1."""
 
 
 def shown_numbers(number: int) -> list[int]:
@@ -58,27 +59,31 @@ def shown_numbers(number: int) -> list[int]:
     return np.unique(np.linspace(0, number - 1, PICTURE_ROWS).round().astype(int)).tolist()
 
 
-def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Figure:
-    """Frame, blurred frame, render, error, rendered and true depth, and events of some held-out frames, side by side.
+def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> Figure:
+    """Frame, blurred frame, render, error, rendered, spread and true depth, and events of some held-out frames.
 
     What the recording does not have is left out.
 
     Args:
         views: Those that are shown, at least one.
         recording: Of which the events are. Of held-out frames on a clock of their own, events are not shown.
+        exponent: Power to which brightness is shown.
     """
     from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    columns = _columns(views, recording)
+    columns = _columns(views, recording, exponent)
     height, width = views[0].depth.shape[:2]
     sides = [*[height / width] * len(views), 0.28]  # the last row explains the colours
     figure = Figure(figsize=(2.35 * len(columns), 0.3 + 2.35 * sum(sides)), layout="constrained", dpi=110)
     axes = figure.subplots(len(views) + 1, len(columns), squeeze=False, height_ratios=sides)
     for column, below in zip(columns, axes.T, strict=True):
         below[0].set_title(column.title)
-        for axis, picture in zip(below[:-1], column.pictures, strict=True):
+        opacities = column.opacities or [None] * len(views)
+        for axis, picture, opacity in zip(below[:-1], column.pictures, opacities, strict=True):
             axis.set_xticks([])
             axis.set_yticks([])
             if picture is None:
@@ -86,8 +91,10 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
                 axis.spines[:].set_visible(False)
             elif column.bar:
                 low, high = column.limits
-                colours = colormaps[column.colours].with_extremes(bad="#c9ced8")
-                shown = axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
+                colours = colormaps[column.colours].with_extremes(bad=UNKNOWN)
+                axis.set_facecolor(UNKNOWN)
+                axis.imshow(picture, cmap=colours, vmin=low, vmax=high, alpha=opacity)
+                shown = ScalarMappable(Normalize(low, high), colours)
             else:
                 axis.imshow(picture)
         below[-1].axis("off")
@@ -106,16 +113,20 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording) -> Fig
     return figure
 
 
-def _columns(views: Sequence[HeldOutView], recording: EventRecording) -> list[Column]:
+def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: float) -> list[Column]:
     rendered = [view.rendered.nan_to_num().clamp(0, 1).numpy() for view in views]
     recorded = [None if view.recorded is None else view.recorded.clamp(0, 1).numpy() for view in views]
+
+    def shown(pictures: Sequence[np.ndarray | None]) -> list[np.ndarray | None]:
+        return [None if picture is None else picture**exponent for picture in pictures]
+
     columns = []
     if any(picture is not None for picture in recorded):
-        columns.append(Column("held-out frame", recorded))
+        columns.append(Column("held-out frame", shown(recorded)))
     blurred = [_blurred_frame(recording, view.time) for view in views]
     if any(picture is not None for picture in blurred):
-        columns.append(Column("blurred frame", blurred))
-    columns.append(Column("render", rendered))
+        columns.append(Column("blurred frame", shown(blurred)))
+    columns.append(Column("render", shown(rendered)))
     if any(picture is not None for picture in recorded):
         errors = [
             None if frame is None else view.rendered.mean(-1).numpy() - frame.mean(-1)
@@ -127,7 +138,14 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording) -> list[Co
     true = [_known_depth(view) for view in views]
     of_scene = [depth for depth in true if depth is not None] or depths
     limits = _quantile(of_scene, 0.01), _quantile(of_scene, 0.99, otherwise=1.0)
-    columns.append(Column("rendered depth", depths, "metres", "viridis", limits))
+    sure = [view.confidence[..., 0].numpy() for view in views if view.confidence is not None]
+    spread = [view.spread_depth[..., 0].numpy() for view in views if view.spread_depth is not None]
+    faded = [(confidence / KNOWN).clip(FAINTEST, 1.0) for confidence in sure] or None
+    columns.append(
+        Column("rendered depth", depths, "metres; pale: not known" if sure else "metres", "viridis", limits, faded)
+    )
+    if spread:
+        columns.append(Column("spread depth", spread, "metres", "viridis", limits))
     if any(depth is not None for depth in true):
         columns.append(Column("true depth", true, "metres; grey: unknown", "viridis", limits))
     if recording.held_out_frames is None:
@@ -186,41 +204,3 @@ def camera_path(cameras: Cameras) -> dict:
             {"camera_to_world": matrix.flatten().tolist(), "fov": fov, "aspect": width / height} for matrix in matrices
         ],
     }
-
-
-def render_video(run: Run, camera_path_file: Path, output: Path) -> None:
-    """Render a flight by `ns-render camera-path`: brightness on the left, depth on the right.
-
-    Depth is coloured from the nearest to the farthest of the scene.
-
-    Args:
-        run: A trained run.
-        camera_path_file: JSON of a `camera_path`.
-        output: The .mp4 file, which is whole afterwards, or as it was before.
-
-    Raises:
-        OSError: It cannot be written.
-        OutputError: The same, where it is ffmpeg that finds out.
-    """
-    from nerfstudio.scripts.render import RenderCameraPath
-
-    manager = run.pipeline.datamanager
-    near, far = scene_depth_range(manager.eval_dataset.recording, manager.config.dataparser.depth_range)
-    scale = manager.train_dataparser_outputs.dataparser_scale
-    partial = output.with_name(f".{output.stem}.partial-{os.getpid()}{output.suffix}")
-    try:
-        RenderCameraPath(
-            load_config=run.config_file,
-            output_path=partial,
-            rendered_output_names=["rgb", "depth"],
-            camera_path_filename=camera_path_file,
-            depth_near_plane=scale * near,
-            depth_far_plane=scale * far,
-        ).main()
-        partial.replace(output)
-    except RuntimeError as error:
-        if not str(error).startswith("Error writing"):  # as mediapy says
-            raise
-        raise OutputError(f"{output} could not be written as a video; make room on the disk.") from error
-    finally:
-        partial.unlink(missing_ok=True)

@@ -53,11 +53,20 @@ class RunFiles:
         return manager.supervision.replace("+", " and ").replace("frames", frames)
 
 
+def find_runs(path: Path) -> list[Path]:
+    """The folders of the runs in a folder and all folders below it, by name; the path itself where there are none, or
+    where it is a file."""
+    path = path.expanduser()
+    if (path / "config.yml").exists():
+        return [path]
+    return sorted(file.parent for file in path.rglob("config.yml")) or [path]
+
+
 def read_run(path: Path) -> RunFiles:
     """What the files of a run tell.
 
     Args:
-        path: The folder of the run, or its config.yml.
+        path: Folder of the run, or its config.yml.
 
     Raises:
         RecordingError: It is no run, or one of a method of another package, or its files cannot be read.
@@ -69,7 +78,7 @@ def read_run(path: Path) -> RunFiles:
     config_file = path / "config.yml" if path.is_dir() else path
     if not config_file.exists():
         found = "holds no config.yml" if path.is_dir() else "does not exist"
-        raise RecordingError(f"{path} {found}; give the folder of a run, or its config.yml.")
+        raise RecordingError(f"{path} {found}; give the folder of a run, of several, or a config.yml.")
     with reading(config_file, "the config.yml of a run"):
         config = yaml.load(config_file.read_text(), Loader=yaml.Loader)  # as Nerfstudio reads it
     if not isinstance(config, TrainerConfig):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from enerf_ns.evaluation.history import HistoryRow
-from enerf_ns.report.figures import SCORES
+from enerf_ns.report.figures import AT_END, SCORES
 from enerf_ns.report.trade_offs import seconds_to_reach
 
 NONE = "-"
@@ -79,7 +79,8 @@ def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
 def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
     """Every row of every history, with its `SCORES`; cells are empty where a row has no such score or loss."""
     rows = [(name, row) for name, history in runs for row in history]
-    scores = [name for name in SCORES if name != "lpips_vgg" or any(name in row.scores for _, row in rows)]
+    optional = ("lpips_vgg", *AT_END)
+    scores = [name for name in SCORES if name not in optional or any(name in row.scores for _, row in rows)]
     losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
     content = io.StringIO()
     writer = csv.writer(content, lineterminator="\n")

@@ -14,18 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.files import fill_page, write_together
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.history import HistoryRow
-from enerf_ns.evaluation.lpips import Net
-from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS, described
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
 from enerf_ns.evaluation.runs import Run, load
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import aligned_views, held_out_views
+from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views, held_out_views
 from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
-from enerf_ns.report.pictures import camera_path, render_video, shown_numbers, side_by_side
+from enerf_ns.report.film import Screen, render_moving, render_video
+from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
 from enerf_ns.report.run_files import RunFiles, read_run, run_names
+from enerf_ns.report.scoring import DEFAULT_SCORING, Scoring
 from enerf_ns.report.tables import NONE, Table, history_csv, reach_table, score_cell, step_parts, step_table
 from enerf_ns.report.trade_offs import default_targets
 
@@ -36,22 +38,6 @@ LARGEST_EMBEDDED_VIDEO = 8_000_000
 """Bytes up to which a video is put into the page; a larger one is a file beside it."""
 
 CSV_FILE = "error-against-time.csv"
-
-
-@dataclass(frozen=True)
-class Scoring:
-    """How held-out frames are scored; by default as every run is at its end."""
-
-    protocol: str = DEFAULT_PROTOCOL
-    """Name of one of `enerf_ns.evaluation.protocols.PROTOCOLS`."""
-    lpips: tuple[Net, ...] = ("alex",)
-    """Networks of LPIPS."""
-    crop: tuple[int, int] | None = None
-    """Height and width of the middle of each frame that alone is scored, pixels; None: all."""
-
-    def __post_init__(self) -> None:
-        if self.protocol not in PROTOCOLS:
-            raise FlagError(f"There is no --protocol {self.protocol}; choose one of {', '.join(PROTOCOLS)}.")
 
 
 @dataclass
@@ -76,6 +62,8 @@ class _Reported:
     picture: tuple[str, bytes] | None = None
     """Name and content of the file with the pictures."""
     video: bytes | None = None
+    video_note: str = ""
+    """What the video shows, and with which gamma."""
     captions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What is left out or wrong, and what to do about it."""
@@ -92,11 +80,11 @@ def write_report(
     runs: Sequence[Run | Path],
     output_dir: Path,
     reach: Sequence[float] | None = None,
-    scoring: Scoring = Scoring(),
+    scoring: Scoring = DEFAULT_SCORING,
     video: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Write report.html, report.md, error-against-time.csv, scores.json, the plots, and of each run that can be loaded
-    side-by-side.png, camera_path.json and video.mp4; of several runs, the last three in a folder for each.
+    side-by-side.png, camera_path.json, video.mp4 and moving.webp; of several runs, these in a folder for each.
 
     Scores are those of the last row of the run's history where it is at its end, else those of the newest whole
     checkpoint; where neither is to be had, those of the last row that has some, over a few frames.
@@ -107,7 +95,7 @@ def write_report(
         output_dir: Made if it does not exist.
         reach: PSNR (dB) whose time is told. None: some that the runs reach.
         scoring: Another way of scoring, for which held-out frames are rendered anew.
-        video: Whether to render a flight past the held-out cameras.
+        video: Whether to render a flight past the held-out cameras, and what was seen along the recorded path.
 
     Returns:
         What scores.json holds: by the name of each run, its state, step, train_seconds, events, and scores.
@@ -198,7 +186,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         dataset = run.pipeline.datamanager.eval_dataset
         one.events = len(index_events(dataset.recording))
         shown = shown_numbers(len(dataset))
-        anew = not at_end or scoring != Scoring()
+        anew = not at_end or scoring != DEFAULT_SCORING
         views, summary = held_out_views(run.pipeline, None if anew else shown)
         stored = int(run.config.load_step or 0) + 1
         if anew:
@@ -207,22 +195,29 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
             one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
             one.protocol = one.scores.pop("protocol")
             views = [views[number] for number in shown]
+        depth_range = scene_depth_range(dataset.recording, run.pipeline.datamanager.config.dataparser.depth_range)
+        screen = Screen.of(views, depth_range)
         views, _ = aligned_views(views, scoring.protocol)
         one.captions.append(
             f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)}, counted from 0, after {stored:,} steps. "
-            f"Error: orange where the render is too bright, purple where it is too dark."
+            f"Error: orange where the render is too bright, purple where it is too dark. Shown as {screen.gamma}."
         )
-        picture = _png(side_by_side(views, dataset.recording))
-        path = json.dumps(camera_path(dataset.cameras))
+        picture = _png(side_by_side(views, dataset.recording, screen.exponent))
+        path = camera_path(dataset.cameras)
         one.picture = f"{one.prefix}side-by-side.png", picture
         with _writing_to(output_dir):
             write_together(
                 output_dir,
-                {one.picture[0]: picture, f"{one.prefix}camera_path.json": path.encode()},
+                {one.picture[0]: picture, f"{one.prefix}camera_path.json": json.dumps(path).encode()},
             )
             if video:
                 folder = output_dir / one.prefix
-                render_video(run, folder / "camera_path.json", folder / "video.mp4")
+                render_moving(run.pipeline, screen, folder / "moving.webp")
+                render_video(run.pipeline, screen, path, folder / "video.mp4")
+                one.video_note = (
+                    f"A flight past the held-out cameras: {screen.gamma}, so that linear brightness looks right on a "
+                    "screen, and depth. moving.webp shows events, render and depth along the recorded path."
+                )
                 one.video = (folder / "video.mp4").read_bytes()
     else:
         _take_preview(one)
@@ -315,6 +310,7 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
             "scored after": f"{one.step:,} steps" if one.scores else NONE,
             "training": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
             **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
+            "brightness scale": _brightness_scale(one),
             "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.num_frames else NONE,
             "of them on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
             "protocol": one.protocol if one.scores else NONE,
@@ -329,10 +325,24 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
             "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored.",
             "On the path are held-out poses that lie among those that were learnt from."
             * ("of them on the path" in header),
+            "The brightness scale is the factor by which the fit multiplies the contrast of renders; in brackets is "
+            "what it should be, the sensor's mean threshold over the one learnt with, where the recording states it."
+            * ("brightness scale" in header),
             *map(described, protocols),
         ]
     )
     return Table("Scores", header, [[row[name] for name in header] for row in rows], note)
+
+
+def _brightness_scale(one: _Reported) -> str:
+    """Scale of the brightness fit, of each channel that has one, and what it should be, of a run that learnt from
+    events, whose contrast is in thresholds."""
+    names = [name for name in one.scores if name.startswith("brightness_scale") and name != EXPECTED_SCALE]
+    if not names or one.protocol != DEFAULT_PROTOCOL or "events" not in one.files.learns_from:
+        return NONE
+    expected = one.scores.get(EXPECTED_SCALE)
+    brackets = [] if expected is None else [f"({score_cell(EXPECTED_SCALE, expected)})"]
+    return " ".join([*(score_cell(name, one.scores[name]) for name in names), *brackets])
 
 
 def _runs_table(reported: Sequence[_Reported]) -> Table:
@@ -374,6 +384,7 @@ def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[
                 "captions": one.captions,
                 "notes": [*one.notes, *_not_scored(one)],
                 "video": video,
+                "video_note": one.video_note,
             }
         )
     return fill_page(
@@ -398,7 +409,7 @@ def _markdown(reported: Sequence[_Reported], tables: Sequence[Table], figures: d
             parts.append(f"![held-out frames]({one.picture[0]})")
         parts += [*one.captions, *one.notes, *_not_scored(one)]
         if one.video is not None:
-            parts.append(f"[Video: brightness and depth, past the held-out cameras]({one.prefix}video.mp4)")
+            parts.append(f"[Video]({one.prefix}video.mp4). {one.video_note}")
     return "\n\n".join(parts) + "\n"
 
 

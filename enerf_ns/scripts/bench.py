@@ -9,10 +9,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from enerf_ns.bench.experiments import EXPERIMENTS
-from enerf_ns.bench.runner import Bench as Runs
-from enerf_ns.bench.runner import BenchSettings
-from enerf_ns.bench.tables import remarks, rich_table
+from enerf_ns.bench.settings import BenchSettings
 
 CONSOLE = Console(width=140)
 
@@ -29,6 +26,9 @@ class Bench:
         if self.experiment is None:
             CONSOLE.print(_experiments())
             return
+        from enerf_ns.bench.runner import Bench as Runs
+        from enerf_ns.bench.tables import remarks, rich_table
+
         bench = Runs(self.experiment, self.settings)
         numbers = {cell: number for number, cell in enumerate(bench.cells, 1)}
         results = []
@@ -45,11 +45,16 @@ class Bench:
         for remark in remarks(told):
             CONSOLE.print(f"* {remark}", markup=False, highlight=False, soft_wrap=True)
         where = bench.output_dir / self.experiment
-        CONSOLE.print(f"The table is in {where}.md, .json and .csv", markup=False, highlight=False, soft_wrap=True)
+        drawn = "; error against time in .png" if where.with_suffix(".png").exists() else ""
+        CONSOLE.print(
+            f"The table is in {where}.md, .json and .csv{drawn}", markup=False, highlight=False, soft_wrap=True
+        )
 
 
 def _experiments() -> Table:
     """What there is, and how many trainings each takes."""
+    from enerf_ns.bench.experiments import EXPERIMENTS
+
     table = Table(title="enerf bench EXPERIMENT", title_justify="left", caption_justify="left", caption=DURATION)
     for column in ("experiment", "what is compared", "trainings", "on"):
         table.add_column(column)

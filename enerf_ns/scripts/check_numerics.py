@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
 from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import write_together
-from enerf_ns.numerics.all_cases import CASES
-from enerf_ns.numerics.case import Result, as_json, as_markdown, run, shown
+
+if TYPE_CHECKING:
+    from enerf_ns.numerics.case import Result
 
 
 @dataclass
@@ -24,6 +25,11 @@ class CheckNumerics:
     """Folder for numerics.md and numerics.json. None: they are not written."""
 
     def main(self) -> None:
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        from enerf_ns.numerics.all_cases import CASES
+        from enerf_ns.numerics.case import as_json, as_markdown, run
+
         results = [run(case) for case in track(CASES, "Checking", console=CONSOLE, transient=True)]
         CONSOLE.print(results_table(results))
         if self.output_dir is not None:
@@ -41,6 +47,8 @@ class CheckNumerics:
 
 def results_table(results: list[Result]) -> Table:
     """The results for the terminal."""
+    from enerf_ns.numerics.case import shown
+
     seconds = sum(result.seconds for result in results)
     table = Table(
         title="Numbers at the extremes", title_justify="left", caption=f"{len(results)} cases, {seconds:.0f} s"

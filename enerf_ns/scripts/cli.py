@@ -1,40 +1,56 @@
-"""The `enerf` command."""
+"""The `enerf` command: the list of commands, of which one alone is imported."""
 
 from __future__ import annotations
 
 import sys
-import warnings
-from typing import Annotated, Union  # tyro reads these annotations on Python 3.10
+from importlib import import_module
 
 import tyro
 
+from enerf_ns import __version__
 from enerf_ns.dataparsers.errors import UserError
-from enerf_ns.scripts.bench import Bench
-from enerf_ns.scripts.check_numerics import CheckNumerics
-from enerf_ns.scripts.convert import Convert
-from enerf_ns.scripts.demo import Demo
-from enerf_ns.scripts.inspect import Inspect
-from enerf_ns.scripts.reconstruct import Reconstruct
-from enerf_ns.scripts.report import Report
-from enerf_ns.scripts.simulate import Simulate
+from enerf_ns.quiet import silence_known_warnings
 
-Command = Union[  # noqa: UP007
-    Annotated[Bench, tyro.conf.subcommand(name="bench")],
-    Annotated[CheckNumerics, tyro.conf.subcommand(name="check-numerics")],
-    Annotated[Convert, tyro.conf.subcommand(name="convert")],
-    Annotated[Demo, tyro.conf.subcommand(name="demo")],
-    Annotated[Inspect, tyro.conf.subcommand(name="inspect")],
-    Annotated[Reconstruct, tyro.conf.subcommand(name="reconstruct")],
-    Annotated[Report, tyro.conf.subcommand(name="report")],
-    Annotated[Simulate, tyro.conf.subcommand(name="simulate")],
-]
+COMMANDS = {
+    "bench": ("Bench", "tables of the paper, and the method's own"),
+    "check-numerics": ("CheckNumerics", "check that numbers hold at the extremes"),
+    "convert": ("Convert", "write a recording or event file in the layout of this package"),
+    "demo": ("Demo", "from nothing to a report with a video, in five minutes"),
+    "export": ("Export", "meshes and point clouds, in metres and in the axes of the recording"),
+    "inspect": ("Inspect", "look at a recording before training on it"),
+    "reconstruct": ("Reconstruct", "reconstruct frames from the events of a recording"),
+    "report": ("Report", "scores, error against time, pictures and videos of runs"),
+    "simulate": ("Simulate", "events of a scene, a mesh, a video or a trained run"),
+}
+"""By name, the class of the command, whose module is named like it, and what it does."""
 
 
 def entrypoint() -> None:
     """Run the command line; a user's mistake ends it with one sentence."""
-    warnings.filterwarnings("ignore", module="nerfstudio")
+    silence_known_warnings()
+    name, arguments = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
+    if name in ("-h", "--help"):
+        _print_help()
+    elif name == "--version":
+        print(f"enerf-ns {__version__}")
+    elif name in COMMANDS:
+        _run(name, arguments)
+    else:
+        print(f"enerf: There is no command {name}; choose one of {', '.join(COMMANDS)}.", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def _print_help() -> None:
+    print("usage: enerf [--help] [--version] COMMAND ...\n\nRadiance fields from event cameras.\n")
+    for name, (_, what) in COMMANDS.items():
+        print(f"  {name:16}{what}")
+    print("\nenerf COMMAND --help tells the flags of a command; ns-train enerf trains.")
+
+
+def _run(name: str, arguments: list[str]) -> None:
+    command = getattr(import_module(f"enerf_ns.scripts.{name.replace('-', '_')}"), COMMANDS[name][0])
     try:
-        tyro.cli(Command, description="Radiance fields from event cameras.").main()
+        tyro.cli(command, prog=f"enerf {name}", args=arguments).main()
     except UserError as error:
         raise SystemExit(f"enerf: {error}") from error
     except MemoryError as error:

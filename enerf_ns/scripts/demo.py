@@ -5,14 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from enerf_ns.evaluation.runs import method_config, train
-from enerf_ns.ranges import check_ranges
-from enerf_ns.report.writing import write_report
-from enerf_ns.scripts.simulate import Simulate
-from enerf_ns.simulator.settings import SimulationSettings
-
 
 @dataclass
 class Demo:
@@ -24,6 +16,14 @@ class Demo:
     """Training steps. None: as many as the method enerf takes."""
 
     def main(self) -> None:
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        from enerf_ns.evaluation.runs import method_config, train
+        from enerf_ns.ranges import check_ranges
+        from enerf_ns.report.writing import write_report
+        from enerf_ns.scripts.simulate import Simulate
+        from enerf_ns.simulator.settings import SimulationSettings
+
         output_dir = self.output_dir.expanduser().resolve()
         recording = output_dir / "recording"
         config = method_config("enerf", recording, output_dir / "runs")

@@ -7,20 +7,19 @@ from pathlib import Path
 from typing import Annotated, Optional  # tyro reads these annotations on Python 3.10
 
 import tyro
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from enerf_ns.report.writing import Scoring, write_report
+from enerf_ns.report.scoring import Scoring
 
 
 @dataclass
 class Report:
-    """Tell how good runs are and how long they took: a page, Markdown, a table of error against time, pictures, videos.
+    """Scores, error against time, pictures and videos of runs, on one page.
 
     Of runs that are still going or crashed, and of those whose recording is gone, whatever there is.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, or their files config.yml."""
+    """Folders of runs, or above runs, or files config.yml."""
     output_dir: Optional[Path] = None  # noqa: UP045
     """Folder for the report. None: that of the run; of several, ./report."""
     reach: Optional[tuple[float, ...]] = None  # noqa: UP045
@@ -31,10 +30,16 @@ class Report:
     """How held-out frames are scored; what is not the default is scored anew."""
 
     def main(self) -> None:
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        from enerf_ns.report.run_files import find_runs
+        from enerf_ns.report.writing import write_report
+
+        runs = [run for path in self.runs for run in find_runs(path)]
         output_dir = self.output_dir
-        if output_dir is None and len(self.runs) == 1:
-            output_dir = self.runs[0] if self.runs[0].is_dir() else self.runs[0].parent
+        if output_dir is None and len(runs) == 1:
+            output_dir = runs[0] if runs[0].is_dir() else runs[0].parent
         output_dir = (output_dir or Path("report")).expanduser().resolve()
-        scores = write_report(self.runs, output_dir, self.reach, self.scoring, self.video)
+        scores = write_report(runs, output_dir, self.reach, self.scoring, self.video)
         CONSOLE.print(scores)
         CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)

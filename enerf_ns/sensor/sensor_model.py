@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import torch
 import tyro
-from jaxtyping import Float, Float64, Int, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor, nn
 
-from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS
-from enerf_ns.sensor.response import ColourFilter, pixel_brightness, response_named
+from enerf_ns.events.batch import EventBatch
+from enerf_ns.sensor.response import ColourFilter, LearnedResponse, pixel_brightness, response_named
+from enerf_ns.sensor.threshold_map import ThresholdMap
 
-DEFAULT_CONTRAST_THRESHOLD = 0.25
-"""Mean threshold assumed where a recording does not state one. Events fix brightness only up to this factor."""
+LARGEST_LAG = 5.0
+"""Most by which brightness is thought to be ahead of a pixel, log brightness; about what a field spans."""
 
 GREY = "grey"
 """Name in place of a Bayer pattern for a sensor without a colour filter."""
@@ -25,16 +28,42 @@ class SensorModelConfig:
 
     _target: Type[SensorModel] = field(default_factory=lambda: SensorModel)  # noqa: UP006
     contrast_thresholds: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
-    """Contrast thresholds C_on and C_off. None: the recording's own, else from the counts of both polarities."""
+    """Contrast thresholds C_on and C_off. None: the recording's own, else from its frames, or from the counts of both
+    polarities and an assumed mean."""
     response: Optional[str] = None  # noqa: UP045
     """What a pixel makes of brightness: linlog, or logarithm:OFFSET; or gamma:EXPONENT:OFFSET, whose field renders
     gamma-encoded brightness. None: the recording's own, else linlog."""
+    learn_response: bool = False
+    """Learn how pixels answer brightness, starting from the response; for events with frames."""
     refractory_period_ns: Optional[int] = None  # noqa: UP045
-    """For how long (ns) a pixel is blind after an event. None: the recording's own."""
+    """For how long (ns) a pixel is blind after an event. None: the recording's own, else what the shortest intervals
+    between events tell."""
+    learn_refractory_period: bool = False
+    """Learn the refractory period, starting from it; each step takes longer, since rays then have gradients."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
     """Colours of the pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; grey: none. None: the recording's own."""
+    learn_threshold_ratio: Optional[bool] = None  # noqa: UP045
+    """Learn C_on / C_off, whose mean stays. None: where the recording does not state the thresholds, and pixels are
+    blind after events, so that counts mislead."""
+    learn_mean_threshold: Optional[bool] = None  # noqa: UP045
+    """Learn the mean of C_on and C_off, which only frames can tell. None: where the field learns from frames, too, and
+    the recording does not state the thresholds."""
+    learn_threshold_map: Optional[bool] = None  # noqa: UP045
+    """Learn how far the thresholds of each pixel are from those of the sensor. None: where the recording does not state
+    the thresholds, and its events show that they differ."""
+    leak_rate: float = 0.0
+    """On events a second of a pixel that sees nothing change."""
+    learn_leak_rate: Optional[bool] = None  # noqa: UP045
+    """Learn the leak rate, starting from it. None: where the recording does not state the thresholds."""
+    cutoff_frequency: Optional[float] = None  # noqa: UP045
+    """Cut-off frequency (Hz) of the photoreceptor at brightness 1; at brightness b it is (255 b + 20) / 275 of that.
+    None: unlimited."""
+    learn_cutoff_frequency: Optional[bool] = None  # noqa: UP045
+    """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds."""
     width: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
     """Width of the sensor, pixels."""
+    height: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
+    """Height of the sensor, pixels."""
 
     def setup(self) -> SensorModel:
         """The sensor of this config, whose class is `_target`."""
@@ -45,9 +74,10 @@ class SensorModel(nn.Module):
     """What an event camera reports of brightness (Klenk et al., E-NeRF, RA-L 2023, equations 1 to 3).
 
     A pixel compares log brightness at two instants, fires one event per contrast threshold crossed, and is then blind
-    for the refractory period. Here all of this are fixed numbers. A subclass that learns one of them holds it as a
-    parameter and overrides the property or method that gives it; nothing else changes, since everybody asks these, and
-    whatever parameters a sensor has are trained as the group "sensor" and stored with the run.
+    for the refractory period. Its memory leaks, and its photoreceptor lags behind, where the config says so. Each of
+    these is a number, or a parameter where it is learned (`get_param_groups`); what is not learned has none. A subclass
+    that learns more holds a parameter and overrides the property or method that gives it; nothing else changes, since
+    everybody asks these.
 
     Args:
         config: With nothing left open.
@@ -60,9 +90,28 @@ class SensorModel(nn.Module):
         super().__init__()
         assert config.contrast_thresholds is not None and config.response is not None
         assert config.refractory_period_ns is not None and config.bayer_pattern is not None
-        self._contrast_thresholds = config.contrast_thresholds
-        self.response = response_named(config.response)
+        on, off = config.contrast_thresholds
+        self._contrast_thresholds = on, off
+        self.log_mean = nn.Parameter(torch.tensor(math.log(0.5 * (on + off)))) if config.learn_mean_threshold else None
+        self.log_ratio = nn.Parameter(torch.tensor(math.log(on / off))) if config.learn_threshold_ratio else None
+        self.leak_rate: Tensor | float = config.leak_rate
+        if config.learn_leak_rate:
+            self.leak_rate = nn.Parameter(torch.tensor(float(config.leak_rate)))
+        delay = 1e3 / (2.0 * math.pi * config.cutoff_frequency) if config.cutoff_frequency else 0.0
+        self.delay: Tensor | float = delay
+        if config.learn_cutoff_frequency:
+            self.delay = nn.Parameter(torch.tensor(delay))
+        self.threshold_map = None
+        if config.learn_threshold_map:
+            assert config.width is not None and config.height is not None
+            self.threshold_map = ThresholdMap(config.width * config.height)
+        response = response_named(config.response)
+        self.response = LearnedResponse(response) if config.learn_response else response
         self.refractory_period = config.refractory_period_ns
+        """For how long (ns) a pixel is blind after an event, before anything is learned of it."""
+        self.log_refractory_period = None
+        if config.learn_refractory_period and config.refractory_period_ns:
+            self.log_refractory_period = nn.Parameter(torch.tensor(math.log(config.refractory_period_ns)).double())
         self.colour_filter = None
         if config.bayer_pattern != GREY:
             assert config.width is not None
@@ -70,8 +119,14 @@ class SensorModel(nn.Module):
 
     @property
     def contrast_thresholds(self) -> tuple[float | Tensor, float | Tensor]:
-        """C_on and C_off, in units of log brightness; numbers, or tensors where they are learned."""
-        return self._contrast_thresholds
+        """C_on and C_off of the sensor, in units of log brightness; numbers, or tensors where they are learned."""
+        on, off = self._contrast_thresholds
+        if self.log_ratio is None and self.log_mean is None:
+            return on, off
+        both = on + off if self.log_mean is None else 2.0 * self.log_mean.exp()
+        if self.log_ratio is None:
+            return both * (on / (on + off)), both * (off / (on + off))
+        return both * torch.sigmoid(self.log_ratio), both * torch.sigmoid(-self.log_ratio)
 
     def log_brightness(
         self, rgb: Float[Tensor, "*batch channels"], pixels: Int64[Tensor, "*batch"]
@@ -82,27 +137,127 @@ class SensorModel(nn.Module):
             rgb: Linear brightness.
             pixels: Their numbers, y * width + x.
         """
-        channel = None if self.colour_filter is None else self.colour_filter.channels(pixels)
-        return self.response(pixel_brightness(rgb, channel))
+        return self.response(self.brightness(rgb, pixels))
 
-    def measured_change(
-        self, on: Int[Tensor, "*batch"], off: Int[Tensor, "*batch"], pixels: Int64[Tensor, "*batch"]
+    def brightness(
+        self, rgb: Float[Tensor, "*batch channels"], pixels: Int64[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Change of log brightness that pixels reported: C_on * (on events) - C_off * (off events).
+        """What each of some pixels sees of one or three colour channels; arguments as of `log_brightness`."""
+        channel = None if self.colour_filter is None else self.colour_filter.channels(pixels)
+        return pixel_brightness(rgb, channel)
 
-        Args:
-            on: Number of positive events after the first instant, up to and with the second.
-            off: Number of negative events in the same interval.
-            pixels: Their numbers, y * width + x.
+    def measured_change(self, batch: EventBatch) -> Float[Tensor, " pairs"]:
+        """Change of log brightness that pixels reported: C_on * (on events) - C_off * (off events), with the thresholds
+        of each pixel, less what leaked; of silent pixels, what leaked alone.
         """
         c_on, c_off = self.contrast_thresholds
-        return c_on * on - c_off * off
+        on, off = c_on * batch.on, c_off * batch.off
+        if self.threshold_map is not None:
+            factors = self.threshold_map.factors(batch.pixels)
+            on, off = on * factors[:, 0], off * factors[:, 1]
+        change = on - off
+        if self.leaks:
+            seconds = 1e-9 * (batch.end - batch.start).double()
+            blind = self.blind_after(batch.start, batch.end) if batch.starts_at_events else None
+            if blind is not None:
+                seconds[batch.fired] -= 1e-9 * blind[batch.fired]
+            change = change - self.leak_rate * c_on * seconds.to(change.dtype)
+        return change
+
+    @property
+    def leaks(self) -> bool:
+        """Whether the memory of a pixel changes by itself."""
+        return isinstance(self.leak_rate, Tensor) or self.leak_rate != 0.0
+
+    @property
+    def lags(self) -> bool:
+        """Whether pixels follow brightness with a delay."""
+        return isinstance(self.delay, Tensor) or self.delay != 0.0
+
+    @property
+    def cutoff_frequency(self) -> float:
+        """Cut-off frequency (Hz) of the photoreceptor at brightness 1; infinite where pixels do not lag."""
+        delay = float(self.delay)
+        return 1e3 / (2.0 * math.pi * delay) if delay > 0.0 else math.inf
+
+    def lag(
+        self, start: Float[Tensor, "pairs channels"], end: Float[Tensor, "pairs channels"], batch: EventBatch
+    ) -> Float[Tensor, " pairs"]:
+        """By how much log brightness changed more between two instants than what the pixels compare.
+
+        A photoreceptor of first order follows log brightness x as y' = w (x - y), so that x - y = y' / w. Of y, events
+        tell the slope: the rates around the instants. The cut-off w grows with brightness as in v2e (Hu, Liu, Delbruck,
+        CVPRW 2021): (255 b + 20) / 275 of that at brightness 1.
+
+        Args:
+            start, end: Rendered at the instants.
+            batch: With `rates`.
+        """
+        assert batch.rates is not None
+        c_on, c_off = self.contrast_thresholds
+        slopes = c_on * batch.rates[..., 0] - c_off * batch.rates[..., 1]
+        lags = []
+        for slope, rgb in zip(slopes.unbind(dim=1), (start, end), strict=True):
+            share = (255.0 * self.brightness(rgb.detach(), batch.pixels) + 20.0) / 275.0
+            lags.append((1e-3 * self.delay * slope / share).clamp(-LARGEST_LAG, LARGEST_LAG))
+        return lags[1] - lags[0]
+
+    def observe(self, change: Float[Tensor, " pairs"], batch: EventBatch) -> None:
+        """Learns what is not learned by gradients from what a training step rendered of a batch.
+
+        Args:
+            change: Rendered change of log brightness of each pair.
+            batch: What was measured.
+        """
+        if self.threshold_map is None:
+            return
+        fired, mean = batch.fired, self.mean_threshold
+        on, off = batch.on[fired], batch.off[fired]
+        c_on, c_off = (threshold / mean for threshold in self.contrast_thresholds)
+        with torch.no_grad():
+            factors = self.threshold_map.factors(batch.pixels[fired]) - 1.0
+            by_map = c_on * on * factors[:, 0] - c_off * off * factors[:, 1]
+            residual = (change[fired] - self.measured_change(batch)[fired]) / mean + by_map
+        self.threshold_map.observe(batch.pixels[fired], on, off, residual, (c_on, c_off))
+
+    def learned(self) -> dict[str, float]:
+        """What was learned, by name: thresholds on and off, refractory period (ms), leak rate (on events a second),
+        cut-off frequency (Hz) and the relative spreads of the thresholds of pixels; empty where nothing was."""
+        found: dict[str, float] = {}
+        if self.log_ratio is not None or self.log_mean is not None:
+            on, off = (float(torch.as_tensor(threshold)) for threshold in self.contrast_thresholds)
+            found |= {"threshold_on": on, "threshold_off": off}
+        if self.log_refractory_period is not None:
+            found["refractory_period_ms"] = 1e-6 * float(self.log_refractory_period.exp())
+        if isinstance(self.leak_rate, Tensor):
+            found["leak_rate"] = float(self.leak_rate)
+        if isinstance(self.delay, Tensor) and float(self.delay) > 0.0:
+            found["cutoff_frequency"] = self.cutoff_frequency
+        if self.threshold_map is not None:
+            on, off = self.threshold_map.spread.tolist()
+            found |= {"spread_on": on, "spread_off": off}
+        return found
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the name of their group, a group for each part that is learned; "sensor" has those that a
+        subclass adds."""
+        groups = {
+            "threshold_ratio": self.log_ratio,
+            "mean_threshold": self.log_mean,
+            "refractory_period": self.log_refractory_period,
+            "response": self.response.log_slopes if isinstance(self.response, LearnedResponse) else None,
+            "bandwidth": self.delay,
+            "leak_rate": self.leak_rate,
+        }
+        found = {name: [value] for name, value in groups.items() if isinstance(value, nn.Parameter)}
+        own = {id(value) for values in found.values() for value in values}
+        others = [value for value in self.parameters() if id(value) not in own]
+        return found | {"sensor": others} if others else found
 
     @property
     def mean_threshold(self) -> float | Tensor:
         """Mean contrast threshold: the unit in which losses count changes of log brightness."""
-        c_on, c_off = self.contrast_thresholds
-        return 0.5 * (c_on + c_off)
+        return 0.5 * sum(self._contrast_thresholds) if self.log_mean is None else self.log_mean.detach().exp()
 
     def blind_after(
         self, event: Int64[Tensor, "*batch"], until: Int64[Tensor, "*batch"]
@@ -118,18 +273,7 @@ class SensorModel(nn.Module):
         """
         if not self.refractory_period:
             return None
-        return (until - 1 - event).clamp(max=self.refractory_period).double()
-
-
-def thresholds_from_polarity(num_on: int, num_off: int) -> tuple[float, float]:
-    """Contrast thresholds (C_on, C_off) under which a whole recording brightens as much as it darkens.
-
-    Over a long recording every pixel's changes nearly cancel, so num_on * C_on = num_off * C_off; the mean of the two,
-    which events cannot tell, is `DEFAULT_CONTRAST_THRESHOLD`. A recording without one of the polarities gives equal
-    thresholds, and one with hardly any events of it the least threshold, of `CONTRAST_THRESHOLD_LIMITS`, for the other.
-    """
-    if num_on == 0 or num_off == 0:
-        return DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD
-    both, least = 2.0 * DEFAULT_CONTRAST_THRESHOLD, CONTRAST_THRESHOLD_LIMITS[0]
-    on = min(max(both * num_off / (num_on + num_off), least), both - least)
-    return on, both - on
+        longest = (until - 1 - event).double()
+        if self.log_refractory_period is None:
+            return longest.clamp(max=self.refractory_period)
+        return torch.minimum(longest, self.log_refractory_period.exp())

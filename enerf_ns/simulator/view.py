@@ -95,8 +95,8 @@ def _run_view(settings: SimulationSettings, config: Path, notes: list[str]) -> V
 
 def _scene_view(settings: SimulationSettings, notes: list[str]) -> View:
     assert settings.scene is not None
-    scene_rng, motion_rng = np.random.default_rng(settings.sensor.seed).spawn(2)
-    scene = _scene(settings, settings.scene, scene_rng, notes)
+    _, motion_rng = np.random.default_rng(settings.sensor.seed).spawn(2)
+    scene = scene_of(settings, notes)
     trajectory = _motion(settings, scene, motion_rng, notes)
     event_camera, frame_camera, event_from_frame = _cameras(settings)
     has_two = is_second_camera(event_camera, frame_camera, event_from_frame)
@@ -114,7 +114,18 @@ def _scene_view(settings: SimulationSettings, notes: list[str]) -> View:
     return View(sources[0], frames, trajectory, *cameras, trajectory.start, end)
 
 
-def _scene(settings: SimulationSettings, name: str, rng: np.random.Generator, notes: list[str]) -> Scene:
+def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
+    """The scene that is seen, the same for the same settings.
+
+    Args:
+        settings: With a scene.
+        notes: Gains a sentence for whatever was left out of a file.
+
+    Raises:
+        RecordingError: The scene is none that is known, or its file cannot be used.
+    """
+    name, rng = settings.scene, np.random.default_rng(settings.sensor.seed).spawn(2)[0]
+    assert name is not None
     if settings.preset is not None:
         name = settings.preset.scene
     if name in SCENES:

@@ -62,12 +62,13 @@ class EventSupervision:
         change = brightness_change(start, end, batch, sensor)
         fired, silent = batch.fired, batch.silent
         losses: dict[str, Tensor] = {}
-        measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
-        if len(measured):
-            loss = EVENT_LOSSES[self.event_loss](change[fired], measured, sensor.mean_threshold)
+        measured = sensor.measured_change(batch)
+        if batch.num_silent < len(batch):
+            loss = EVENT_LOSSES[self.event_loss](change[fired], measured[fired], sensor.mean_threshold)
             losses["event_loss"] = self.event_loss_weight * loss
         if batch.num_silent:
-            loss = no_event_loss(change[silent], sensor.contrast_thresholds, self.no_event_margin)
+            silence = change[silent] - measured[silent] if sensor.leaks else change[silent]
+            loss = no_event_loss(silence, sensor.contrast_thresholds, self.no_event_margin)
             losses["no_event_loss"] = self.no_event_loss_weight * loss
         return losses
 
@@ -83,7 +84,7 @@ class EventSupervision:
         """event_correlation: the linear correlation of rendered and measured changes; arguments as of `losses`."""
         fired = batch.fired
         change = brightness_change(start, end, batch, sensor)[fired]
-        measured = sensor.measured_change(batch.on[fired], batch.off[fired], batch.pixels[fired])
+        measured = sensor.measured_change(batch)[fired]
         # of what is centred, the cosine; torch.corrcoef would have a GPU waited for
         change, measured = change - change.mean(), measured - measured.mean()
         return {"event_correlation": cosine_similarity(change, measured, dim=0)}
@@ -97,4 +98,5 @@ def brightness_change(
     sensor: SensorModel,
 ) -> Float[Tensor, " pairs"]:
     """Change of log brightness, as the pixels of a batch see what was rendered at their two instants."""
-    return sensor.log_brightness(end, batch.pixels) - sensor.log_brightness(start, batch.pixels)
+    change = sensor.log_brightness(end, batch.pixels) - sensor.log_brightness(start, batch.pixels)
+    return change - sensor.lag(start, end, batch) if sensor.lags and batch.rates is not None else change

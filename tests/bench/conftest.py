@@ -6,7 +6,8 @@ import pytest
 import torch
 from small_runs import SMALL_BENCH
 
-from enerf_ns.bench.runner import Bench, BenchSettings
+from enerf_ns.bench.runner import Bench
+from enerf_ns.bench.settings import BenchSettings
 
 
 @pytest.fixture(scope="session")

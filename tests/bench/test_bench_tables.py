@@ -175,3 +175,11 @@ def test_csv_has_a_line_for_each_run_that_finished():
         ("events", "0", 25.0),
         ("events", "1", 26.0),
     ]
+
+
+def test_what_a_score_should_be_stands_in_brackets_where_it_is_known():
+    known = {"brightness_scale": 0.75, "true_brightness_scale": 0.8}
+    runs = [run("learned", None, scores={"log-affine-set": known})]
+    runs += [run("learned", None, "other", scores={"log-affine-set": {"brightness_scale": 0.5}})]
+    found = rows_of(markdown(results(*runs, columns=["brightness_scale"], published={})))
+    assert [line[2] for line in found] == ["0.750 (0.800)", "0.500"]

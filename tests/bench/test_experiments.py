@@ -8,13 +8,14 @@ from statistics import mean
 import pytest
 
 from enerf_ns.bench import published
-from enerf_ns.bench.experiments import EXPERIMENTS, FORCED_ON, LEFT_OUT, ROWS, SEQUENCES, Sequence
+from enerf_ns.bench.experiments import EXPERIMENTS, FORCED_ON, LEFT_OUT, ROWS, SEQUENCES, Sequence, known_sensor
 from enerf_ns.bench.measures import MEASURES
 from enerf_ns.bench.published import MEAN
 from enerf_ns.bench.tables import LOWER_IS_BETTER
 from enerf_ns.evaluation.runs import method_config
 from enerf_ns.paper_selections import PRESETS
 from enerf_ns.simulator import paper_sequences
+from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.scenes import SCENES
 
 
@@ -46,7 +47,8 @@ def test_every_setting_of_a_row_is_one_of_the_method(name: str):
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_every_sequence_can_be_made(name: str):
     sequence: Sequence = SEQUENCES[name]
-    method_config("enerf", Path("recording"), Path("runs"), sequence.changes)
+    known = known_sensor(SensorSettings(**(sequence.sensor or {})))
+    method_config("enerf", Path("recording"), Path("runs"), {**sequence.changes, **known})
     assert sequence.preset is None or sequence.preset in PRESETS
     assert sequence.scene is None or sequence.scene in {**paper_sequences.PRESETS, **SCENES, **sequence.files}
 

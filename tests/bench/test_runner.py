@@ -14,18 +14,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from small_runs import SMALL_BENCH
 
 from enerf_ns.bench import runner
 from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
-from enerf_ns.bench.measures import evaluate, milliseconds_a_step
-from enerf_ns.bench.runner import Bench, BenchSettings, parse_budget, steps_of
+from enerf_ns.bench.measures import MEASURES, TRUTH, evaluate, milliseconds_a_step
+from enerf_ns.bench.runner import Bench, parse_budget, steps_of
+from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.enerf_trainer import EnerfTrainer
 from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.runs import load, method_config
 from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.sensor.threshold_map import ThresholdMap
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.event_sensor import SensorSettings
+from enerf_ns.simulator.settings import SimulationSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -232,6 +240,83 @@ def test_measures_of_a_run(finished: Path):
     assert found["megabytes_a_step"] > 4 * parameters / 1e6
     parts = [found[name] for name in ("sample", "poses", "rays", "images", "forward_and_backward")]
     assert sum(parts) == pytest.approx(100.0) and found["images"] == 0.0 and min(parts[:3]) > 0.0
+
+
+@pytest.fixture(scope="session")
+def finished_sensor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output folder of a small bench of the experiment sensor, of one sequence with faults."""
+    folder = tmp_path_factory.mktemp("sensor")
+    finish(folder, name="sensor", sequences=("faults",), rows=())
+    return folder
+
+
+def test_a_recording_of_the_experiment_on_sensors_states_nothing_of_its_sensor(finished_sensor: Path):
+    (folder,) = finished_sensor.glob("recordings/*")
+    recording = read_recording(folder)
+    assert (recording.contrast_thresholds, recording.response, recording.refractory_period) == (None, None, 0)
+    assert recording.depth_range is not None and recording.blurred_frames is not None, "all else is stated"
+    truth = json.loads((folder / TRUTH).read_text())
+    assert truth["contrast_thresholds"] == [0.28, 0.2] and truth["sensor"]["refractory_period"] == 8_000_000
+    for file in folder.glob("*.json"):
+        assert (file.name == TRUTH) == ("thresholds" in file.read_text())
+
+
+def test_an_own_layout_states_nothing_of_its_sensor_either_but_for_its_filter(tmp_path: Path):
+    settings = SimulationSettings("shapes", width=32, height=24, duration=0.02, num_frames=1, layout="event_recording")
+    sensor = SensorSettings(contrast_thresholds=(0.3, 0.2), refractory_period=1000)
+    stated, hidden = tmp_path / "stated", tmp_path / "hidden"
+    simulate(replace(settings, sensor=sensor), stated)
+    about = stated / "recording.json"
+    about.write_text(json.dumps({**json.loads(about.read_text()), "bayer_pattern": "RGGB"}))
+    shutil.copytree(stated, hidden)
+    runner.hide_sensor(hidden)
+    before, after = read_recording(stated), read_recording(hidden)
+    assert (before.contrast_thresholds, before.refractory_period) == ((0.3, 0.2), 1000) and before.response is not None
+    assert (after.contrast_thresholds, after.response, after.refractory_period) == (None, None, 0)
+    assert (after.bayer_pattern, after.camera, after.depth_range) == ("RGGB", before.camera, before.depth_range)
+
+
+def test_what_is_told_of_the_sensor_is_what_was_simulated_or_nothing(finished_sensor: Path):
+    """Fixed and known by their flags; learned by none."""
+    runs = {run["row"]: run for run in json.loads((finished_sensor / "sensor.json").read_text())["runs"]}
+    assert not [run for run in runs.values() if "failure" in run]
+    run = bench(finished_sensor, name="sensor", sequences=("faults",), rows=())
+    configs = {cell.row: run._config(cell, Path("run")).pipeline.model.sensor for cell in run.cells}
+    told = {row: (of.contrast_thresholds, of.response, of.refractory_period_ns) for row, of in configs.items()}
+    assert told["learned"] == (None, None, None)
+    assert told["fixed"] == ((0.25, 0.25), "linlog", 0)
+    assert told["known"] == ((0.28, 0.2), "logarithm:0.001", 8_000_000)
+    scores = {row: run["scores"]["log-affine-set"] for row, run in runs.items()}
+    found = [(scores[row]["threshold_ratio"], scores[row]["refractory_ms"]) for row in ("fixed", "known")]
+    assert found == [(1.0, 0.0), (pytest.approx(1.4), 8.0)]
+    for of in scores.values():
+        assert (of["true_threshold_ratio"], of["true_refractory_ms"]) == (pytest.approx(1.4), 8.0)
+
+
+def test_a_threshold_map_is_compared_with_the_thresholds_of_the_pixels(finished_sensor: Path):
+    """One that is the true one but for noise has the correlation that noise leaves; one that is flat has none."""
+    (folder,) = finished_sensor.glob("runs/faults/enerf/learned-*")
+    run = replace(load(folder / "config.yml"), train_seconds=3.0)
+    (recording,) = finished_sensor.glob("recordings/*")
+    thresholds = np.load(recording / "thresholds.npy")
+    assert thresholds.shape == (2, 24, 32)
+    relative = thresholds / thresholds.mean(axis=(1, 2), keepdims=True) - 1
+    relative[0] += np.random.default_rng(0).normal(0, relative[0].std(), relative[0].shape)
+    sensor = run.pipeline.model.sensor
+
+    assert isinstance(sensor.leak_rate, torch.Tensor)
+    torch.nn.init.constant_(sensor.leak_rate, 0.25)
+    sensor.threshold_map = ThresholdMap(24 * 32)
+
+    def measured() -> dict[str, float]:
+        return MEASURES["sensor"](run, held_out_views(run.pipeline)[0])
+
+    assert not any(name.startswith("threshold_map") for name in measured())
+    sensor.threshold_map.deviations.copy_(torch.from_numpy(relative.reshape(2, -1).T))
+    found = measured()
+    assert found["threshold_map_on"] == pytest.approx(2**-0.5, abs=0.05)
+    assert found["threshold_map_off"] == pytest.approx(1.0, abs=1e-6)
+    assert (found["leak_rate"], found["true_leak_rate"]) == (0.25, 0.0)
 
 
 @pytest.mark.parametrize(

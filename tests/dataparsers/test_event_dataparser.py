@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from enerf_ns.dataparsers import event_dataparser
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence
 from enerf_ns.dataparsers.event_dataparser import (
     EventDataParserConfig,
     split_frames,
@@ -41,7 +41,9 @@ FORMATS = {"esim": write_esim, "davis": write_davis}
 
 def parse(folder: Path, split: str = "train", **options) -> DataparserOutputs:
     config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR), **options)
-    return config.setup().get_dataparser_outputs(split)
+    with exit_with_a_sentence():
+        parser = config.setup()
+        return parser.outputs(parser.recording(), split)
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -148,6 +150,15 @@ def test_training_frames_are_blurred_by_default_and_evaluation_is_always_on_shar
         "sharp": {"images"},
     }[choice]
     assert {file.parent.name for file in parse(folder, "test").image_filenames} == {"images"}
+
+
+@pytest.mark.parametrize(("by", "folder"), [(None, "images"), ("E2VID", "images_corrupted")])
+def test_other_methods_train_on_sharp_frames_or_on_those_that_were_made_of_events(tmp_path: Path, by, folder: str):
+    recording = read_recording(write_esim(tmp_path / "esim", frames=("images", "images_corrupted")))
+    recording = replace(recording, reconstructed_by=by)
+    for held_out, expected in ((False, folder), (True, "images")):
+        frames, _ = split_frames(recording, EventDataParserConfig(), held_out)
+        assert {file.parent.name for file in frames.filenames} == {expected}
 
 
 def test_frames_exposed_beyond_the_poses_are_not_trained_on_but_are_evaluated(tmp_path: Path):

@@ -45,6 +45,21 @@ def test_index_equals_a_list_per_pixel(num_events: int, width: int, height: int,
                 assert j - i - on == polarities.count(-1)
 
 
+def test_events_within_spans_are_those_of_a_mask() -> None:
+    events = random_events(2000, 7, 5, 1000)
+    index = EventIndex.from_events(events, 7, 5)
+    spans = np.array([[500, 620], [10, 20], [15, 40], [900, 900], [990, 5000], [-9, -3]])
+    inside = ((events.t[:, None] >= spans[:, 0]) & (events.t[:, None] <= spans[:, 1])).any(1)
+    found = index.events_within(spans)
+    order = np.lexsort((events.y[inside].astype(int) * 7 + events.x[inside], events.t[inside]))
+    for name in "xyt":
+        np.testing.assert_array_equal(getattr(found, name), getattr(events, name)[inside][order])
+    assert sorted(zip(found.t, found.x, found.y, found.p, strict=True)) == sorted(
+        zip(*(getattr(events, name)[inside] for name in "txyp"), strict=True)
+    )
+    assert len(index.events_within(np.zeros((0, 2), np.int64))) == 0
+
+
 def test_events_of_one_time_keep_their_order() -> None:
     polarity = np.array([1, -1, -1, 1, 1, -1, 1], np.int8)
     zero = np.zeros(7, np.uint16)

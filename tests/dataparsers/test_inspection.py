@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from browsers import BROWSER, told_by
 from PIL import Image
 from recordings import FRAME_TIMES, HEIGHT, WIDTH, image, poses, write_davis, write_esim
 from rich.console import Console
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
+from stripes import recording_of_stripes
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.event_index import event_picture
@@ -32,7 +34,9 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
-VOID = {"meta", "img", "br"}
+"""A browser that draws pages without a screen."""
+
+VOID = {"meta", "img", "br", "input"}
 
 
 class Page(HTMLParser):
@@ -189,10 +193,13 @@ def test_numbers_of_a_small_recording(tmp_path: Path):
     assert found["poses"] == "11, 0.000 s to 1.000 s, usually every 100 ms"
     assert found["frames"] == "3, 0.150 s to 0.750 s, with depth"
     assert found["event camera"] == "24 x 18, pinhole, sees 62 x 48 degrees"  # 2 atan(12 / 20), 2 atan(9 / 20)
-    assert found["frame camera"] == "the same" and found["thresholds"] == "not stated"
+    assert found["frame camera"] == "the same"
+    sensor = inspection.sensor.rows()
+    assert sensor["thresholds"].startswith("C_on = 0.5 ± ") and sensor["refractory"] == "events show none"
+    assert sensor["spread"].endswith("cannot be told from 0") and sensor["noise"].startswith("unknown")
+    assert sensor["frame bursts"].startswith("none")
     assert numbers["event rate"].startswith("8 a second")
     assert numbers["polarity"] == "66.7 % on, 33.3 % off"
-    assert numbers["implied ratio"].startswith("C_on = 0.5 C_off")
     assert numbers["a pixel"] == "0.0139 events; 99.5 % of the pixels have fewer than two"
     assert numbers["path"] == "0.79 m long, spans 0.79 m"
     assert numbers["near and far"].startswith("0.5 m and 4 m, stated")
@@ -261,12 +268,41 @@ def test_no_path_is_drawn_where_there_are_no_poses():
     assert inspection.numbers()["pose coverage"].endswith("1 gap")
 
 
+MEASURE = """  document.getAnimations().forEach(animation => animation.pause());
+  const shown = () => [...document.querySelectorAll(".stack")].map(stack =>
+    [...stack.querySelectorAll(".events")].map(picture => Number(getComputedStyle(picture).opacity)));
+  const seen = { flick: shown(), flicking: document.getAnimations().length, page: document.documentElement.scrollWidth,
+    width: innerWidth, images: [...document.images].map(i => [i.alt, i.complete, i.naturalWidth, i.clientWidth]) };
+  document.querySelector("[for=delay-2]").click();
+  seen.chosen = shown(); seen.left = document.getAnimations().length;"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
+@pytest.mark.parametrize("width", [500, 1280])
+def test_a_browser_flicks_between_right_and_wrong_times(tmp_path: Path, width: int):
+    """One picture of events is over each frame at a time, and the one whose time is chosen."""
+    inspection = Inspection.of(recording_of_stripes(tmp_path, 12_000_000))
+    assert inspection.agreement and inspection.agreement.frame_delay
+    assert inspection.agreement.frame_delay.value == pytest.approx(12, abs=1)
+    assert any("the frames are stamped 1" in problem.what for problem in inspection.problems)
+    page = tmp_path / "page.html"
+    page.write_text(inspection.page())
+    seen = told_by(page, MEASURE, width, tmp_path / "browser")
+    assert seen["page"] <= seen["width"]
+    assert all(complete and natural and shown for _, complete, natural, shown in seen["images"])
+    assert len(seen["flick"]) == 4 and all(sum(shown) == 1 and shown[0] + shown[5] == 1 for shown in seen["flick"])
+    assert seen["flicking"] == 8 and seen["left"] == 0 and seen["chosen"] == 4 * [[0, 0, 1, 0, 0, 0]]
+
+
 @pytest.mark.slow
 def test_slider_depth_has_no_problems(shared_data: Path):
     """Its authors state depths of 0.45 to 2.07 m."""
     page = page_of(shared_data / "slider_depth")
     assert "No problems were found." in page.text
-    assert len(page.images) == 2 * 6 + 3
+    names = [name for name, _ in page.images]
+    assert sum(name.startswith("events on the frame at") for name in names) == 4 * 6
+    assert sum(name.startswith("events as stated: 100 %") for name in names) == 3
+    assert "clock of poses" in page.text and "fit the events to 0.8 pixels" in page.text
     depths = re.search(r"near and far([\d.]+) m and ([\d.]+) m, measured", page.text)
     assert depths and 0.2 < float(depths[1]) < 0.45 and 2.07 < float(depths[2]) < 4.0
 

@@ -275,7 +275,6 @@ def test_statistics_against_slow_loops(at_once: int, monkeypatch: pytest.MonkeyP
     few = sum(counts.get((y, x), 0) < 2 for y in range(CAMERA.height) for x in range(CAMERA.width))
     assert few > 24 and statistics.share_below_two == few / (CAMERA.width * CAMERA.height)
     assert statistics.events_per_pixel == len(events) / (32 * 24)
-    assert statistics.threshold_ratio == (len(events) - on) / on
     assert statistics.edges[0] == events[0, 2] and statistics.edges[-1] == events[-1, 2]
     assert statistics.seconds == pytest.approx((events[-1, 2] - events[0, 2]) * 1e-9, rel=1e-12)
     expected = np.histogram(events[:, 2], statistics.edges)[0]

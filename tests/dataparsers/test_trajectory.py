@@ -202,3 +202,6 @@ def test_a_mounted_camera_moves_with_the_body() -> None:
     bodies[:, :3, :3], bodies[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), positions
     mounted = Trajectory(times, positions, quaternions).of_mounted(mount)
     np.testing.assert_allclose(mounted.poses(torch.from_numpy(times)).numpy(), (bodies @ mount)[:, :3], atol=1e-12)
+    assert mounted.body is not None and mounted.body[0].body is None
+    np.testing.assert_array_equal(mounted.body[0].quaternions, quaternions)
+    np.testing.assert_array_equal(mounted.body[1], mount)

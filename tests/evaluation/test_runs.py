@@ -20,12 +20,13 @@ def parameters(pipeline: torch.nn.Module) -> dict[str, torch.Tensor]:
 
 
 def test_a_configuration_is_a_copy_with_changes(tmp_path: Path):
-    before = all_methods["enerf"].pipeline.datamanager.max_pair_distance
-    config = method_config("enerf", tmp_path / "data", tmp_path, {"pipeline.datamanager.max_pair_distance": before + 1})
-    assert config.pipeline.datamanager.max_pair_distance == before + 1
+    before = all_methods["enerf"].pipeline.datamanager.held_out_events
+    changes = {"pipeline.datamanager.held_out_events": 2 * before}
+    config = method_config("enerf", tmp_path / "data", tmp_path, changes)
+    assert config.pipeline.datamanager.held_out_events == 2 * before
     assert config.data == config.pipeline.datamanager.data == tmp_path / "data"
     assert (config.output_dir, config.vis) == (tmp_path, "tensorboard")
-    assert all_methods["enerf"].pipeline.datamanager.max_pair_distance == before and all_methods["enerf"].data is None
+    assert all_methods["enerf"].pipeline.datamanager.held_out_events == before and all_methods["enerf"].data is None
 
 
 @pytest.mark.parametrize("name", ["nerfacto", "nothing"])

@@ -16,6 +16,7 @@ from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_view, held_out_views, save_pictures
+from enerf_ns.events.batch import EventBatch
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 METRES = 2.5
@@ -112,6 +113,49 @@ def test_every_run_is_aligned_alike_whatever_it_learnt_from(
     monkeypatch.setattr(shown.datamanager.config, "supervision", supervision)
     table = summary_scores(*held_out_views(shown))
     assert table["protocol"] == "log-affine-set" and isinstance(table["brightness_scale"], float)
+
+
+@pytest.mark.parametrize("response", ["linlog", "gamma:2.0:0.001"])
+def test_the_scale_of_a_field_that_explains_all_events_is_the_expected_one(
+    shown: Any, monkeypatch: pytest.MonkeyPatch, response: str
+):
+    """Log brightness that rose or fell from one level makes as many events as thresholds fit in between; the field has
+    the change that these measure with the thresholds it learnt with, which are 1.2 times the true ones."""
+    true = shown.datamanager.eval_dataset.recording.contrast_thresholds
+    learnt_with = tuple(1.2 * threshold for threshold in true)
+    config = replace(shown.model.config.sensor, contrast_thresholds=learnt_with, response=response)
+    monkeypatch.setitem(shown.model._modules, "sensor", config.setup())
+    exponent = 2.0 if response != "linlog" else 1.0
+    views, summary = held_out_views(shown)
+    for view in views:
+        assert view.recorded is not None
+        view.recorded = 0.2 + 0.8 * view.recorded.double()  # where linlog is a logarithm
+        change = linlog(view.recorded) - 5.0
+        on, off = change.clamp(min=0.0) / true[0], (-change).clamp(min=0.0) / true[1]
+        nothing = torch.zeros(on.shape, dtype=torch.long)
+        measured = shown.model.sensor.measured_change(EventBatch(nothing, nothing, nothing, on, off))
+        view.rendered = inverse_linlog((5.0 + measured) / exponent + np.log(255) * (1 - 1 / exponent))
+    table = summary_scores(views, summary)
+    assert table["brightness_scale"] == pytest.approx(exponent / 1.2, rel=1e-6)
+    assert table["brightness_scale_expected"] == pytest.approx(exponent / 1.2, rel=1e-6)
+
+
+def test_a_scale_is_expected_of_what_was_learnt_from_events_with_known_thresholds_and_fitted_once(
+    shown: Any, monkeypatch: pytest.MonkeyPatch
+):
+    name = "brightness_scale_expected"
+    views, summary = held_out_views(shown)
+    assert summary[name] == 1.0 and summary_scores(views, summary)[name] == 1.0
+    for protocol in ("raw", "eventnerf", "log-affine-image", "log-offset"):
+        assert name not in summary_scores(views, summary, protocol=protocol)
+    negatives = [replace(view, rendered=1.2 - view.rendered) for view in views]
+    assert name not in summary_scores(negatives, summary)
+    monkeypatch.setattr(shown.datamanager.config, "supervision", "frames")
+    assert name not in held_out_views(shown)[1]
+    monkeypatch.setattr(shown.datamanager.config, "supervision", "events")
+    dataset = shown.datamanager.eval_dataset
+    monkeypatch.setattr(dataset, "recording", replace(dataset.recording, contrast_thresholds=None))
+    assert name not in held_out_views(shown)[1]
 
 
 def test_one_render_that_is_not_finite_is_left_as_it_is_and_the_others_are_aligned_as_without(shown: Any):

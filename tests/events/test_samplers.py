@@ -295,7 +295,11 @@ def test_successors_measure_the_threshold_and_other_pairs_miss_what_changes_whil
     def errors(sampler: EventPairSampler, refractory: int) -> tuple[list[float], list[float]]:
         """Of every drawn pair, the change that it measures too little, and what changed in between unseen."""
         pairs = seen_from(sampler.sample(2000, generator), refractory)
-        measured = sensor_with(refractory).measured_change(pairs.on.double(), pairs.off.double(), pairs.pixels).tolist()
+        measured = (
+            sensor_with(refractory)
+            .measured_change(replace(pairs, on=pairs.on.double(), off=pairs.off.double()))
+            .tolist()
+        )
         changes = [signal_of(pixel)(end) - signal_of(pixel)(start) for pixel, start, end in rows(pairs)]
         unseen = [sum(blind[pixel, t] for t, _ in pixels[pixel] if a < t < b) for pixel, a, b in rows(pairs)]
         return [change - m for change, m in zip(changes, measured, strict=True)], unseen

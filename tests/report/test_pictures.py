@@ -1,27 +1,23 @@
 from __future__ import annotations
 
-import errno
-import json
 import math
-import resource
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.axes import Axes
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.scripts import render
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.event_index import EventIndex, event_picture
 from enerf_ns.dataparsers.recording import EventRecording, Events
+from enerf_ns.evaluation.metrics import KNOWN
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.views import HeldOutView, held_out_views
-from enerf_ns.report.pictures import camera_path, render_video, shown_numbers, side_by_side
+from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
 
 
 def shown(run: Run) -> list[HeldOutView]:
@@ -33,7 +29,7 @@ def test_the_shown_views_are_the_first_the_last_and_those_between(number: int, e
     assert shown_numbers(number) == expected
 
 
-ALL = ["held-out frame", "blurred frame", "render", "error", "rendered depth", "true depth", "events"]
+ALL = ["held-out frame", "blurred frame", "render", "error", "rendered depth", "spread depth", "true depth", "events"]
 
 
 def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
@@ -52,23 +48,46 @@ def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
     without_depth = [replace(view, recorded_depth=None) for view in views]
     assert titles(without_depth, recording) == [name for name in ALL if name != "true depth"]
     without_frames = [replace(view, recorded=None) for view in without_depth]
-    assert titles(without_frames, replace(recording, frames=None, blurred_frames=None)) == ALL[2:3] + ALL[4:5] + ALL[6:]
+    assert titles(without_frames, replace(recording, frames=None, blurred_frames=None)) == ALL[2:3] + ALL[4:6] + ALL[7:]
+    unsure = [replace(view, confidence=None, spread_depth=None) for view in views]
+    assert titles(unsure, recording) == [name for name in ALL if name != "spread depth"]
 
 
 def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run):
     views = shown(run)
     figure = side_by_side(views, run.pipeline.datamanager.eval_dataset.recording)
-    pictures: Any = [axis.images[0] for axis in figure.axes[: 7 * len(views)]]
+    pictures: Any = [axis.images[0] for axis in figure.axes[: 8 * len(views)]]
     for number, view in enumerate(views):
-        row = pictures[7 * number : 7 * number + 7]
+        row = pictures[8 * number : 8 * number + 8]
         assert view.recorded is not None and view.recorded_depth is not None
         expected = (view.rendered - view.recorded.clamp(0, 1)).mean(-1).numpy()
         np.testing.assert_allclose(row[3].get_array(), expected, atol=1e-6)
         low, high = row[3].get_clim()
         assert low == -high and 0 < high <= np.abs(expected).max() + 1
-        depth = np.ma.filled(row[5].get_array(), np.nan)
+        depth = np.ma.filled(row[6].get_array(), np.nan)
         np.testing.assert_array_equal(np.isnan(depth), view.recorded_depth[..., 0].numpy() <= 0)
-        assert row[4].get_clim() == row[5].get_clim()
+        assert row[4].get_clim() == row[5].get_clim() == row[6].get_clim()
+
+
+def test_depth_that_is_not_known_is_pale(run: Run):
+    view = shown(run)[0]
+    confidence = torch.linspace(0.0, 1.0, view.depth.numel()).view(view.depth.shape)
+    figure = side_by_side([replace(view, confidence=confidence)], run.pipeline.datamanager.eval_dataset.recording)
+    (depth,) = [axis.images[0] for axis in figure.axes if axis.get_title() == "rendered depth"]
+    opacity = np.asarray(depth.get_alpha())
+    assert (opacity[confidence[..., 0].numpy() >= KNOWN] == 1).all() and opacity[0, 0] < 0.3
+    assert (np.diff(opacity.ravel()) >= 0).all()
+    assert "not known" in "".join(axis.get_xlabel() for axis in figure.findobj(Axes) if isinstance(axis, Axes))
+
+
+def test_brightness_is_shown_to_a_power_and_nothing_else_is(run: Run):
+    recording, views = run.pipeline.datamanager.eval_dataset.recording, shown(run)[:1]
+    as_it_is, brighter = (side_by_side(views, recording, exponent).axes for exponent in (1.0, 0.5))
+    for title, one, other in zip(ALL, as_it_is, brighter, strict=False):
+        expected = np.asarray(one.images[0].get_array())
+        if title in ("held-out frame", "blurred frame", "render"):
+            expected = np.sqrt(expected)
+        np.testing.assert_allclose(np.asarray(other.images[0].get_array()), expected, atol=1e-6)
 
 
 def test_the_legend_has_the_colours_of_brighter_and_darker(run: Run):
@@ -125,61 +144,3 @@ def test_the_flight_of_a_large_camera_is_reduced_and_sees_as_much():
 def test_one_held_out_camera_stands_still():
     flown = camera_path(cameras(1))["camera_path"]
     assert len(flown) == 100 and flown[0]["camera_to_world"] == pytest.approx(flown[-1]["camera_to_world"])
-
-
-def test_depth_is_coloured_from_the_nearest_to_the_farthest(run: Run, tmp_path: Path, monkeypatch):
-    asked: dict[str, Any] = {}
-
-    class Renderer:
-        def __init__(self, **settings: Any):
-            asked.update(settings)
-
-        def main(self) -> None:
-            asked["output_path"].write_text("video")
-
-    monkeypatch.setattr(render, "RenderCameraPath", Renderer)
-    render_video(run, tmp_path / "path.json", tmp_path / "video.mp4")
-    near, far = run.pipeline.datamanager.eval_dataset.recording.depth_range  # type: ignore[misc]
-    scale = run.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
-    assert asked["load_config"] == run.config_file and asked["camera_path_filename"] == tmp_path / "path.json"
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("video.mp4", "video")]
-    assert asked["depth_near_plane"] == pytest.approx(run.pipeline.config.model.near_plane)
-    assert asked["depth_far_plane"] == pytest.approx(far * scale) and asked["depth_near_plane"] == near * scale
-
-
-@pytest.mark.parametrize(
-    "failure", [OSError(errno.ENOSPC, "No space left on device"), SystemExit(1), RuntimeError("x")]
-)
-def test_a_video_that_breaks_off_leaves_the_one_of_before(
-    run: Run, tmp_path: Path, monkeypatch, failure: BaseException
-):
-    class Renderer:
-        def __init__(self, output_path: Path, **settings: Any):
-            self.output_path = output_path
-
-        def main(self) -> None:
-            self.output_path.write_text("half")
-            raise failure
-
-    (tmp_path / "video.mp4").write_text("before")
-    monkeypatch.setattr(render, "RenderCameraPath", Renderer)
-    with pytest.raises(type(failure)):
-        render_video(run, tmp_path / "path.json", tmp_path / "video.mp4")
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("video.mp4", "before")]
-
-
-@pytest.mark.slow
-def test_a_disk_too_small_for_the_video_is_one_sentence(run: Run, tmp_path: Path):
-    """By a limit of the size of files, which ffmpeg inherits."""
-    (tmp_path / "video.mp4").write_text("before")
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps(camera_path(run.pipeline.datamanager.eval_dataset.cameras)))
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
-        with pytest.raises((OutputError, OSError)):
-            render_video(run, path, tmp_path / "video.mp4")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert (tmp_path / "video.mp4").read_text() == "before"
-    assert {file.name for file in tmp_path.iterdir()} == {"video.mp4", "path.json"}

@@ -14,7 +14,7 @@ from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.evaluation.history import HistoryRow, append_row
 from enerf_ns.evaluation.runs import Run
 from enerf_ns.report import run_files
-from enerf_ns.report.run_files import read_run, run_names
+from enerf_ns.report.run_files import find_runs, read_run, run_names
 
 CopyRun = Callable[..., Path]
 
@@ -97,9 +97,21 @@ def test_a_history_that_cannot_be_read_is_one_sentence(copy_run: CopyRun):
         read_run(folder)
 
 
+def test_runs_are_found_in_a_folder_and_below_it_in_order(tmp_path: Path):
+    folders = [tmp_path / name for name in ("b/enerf/2026-01-02", "a/enerf/2026-01-01", "b/enerf-robust/2026-01-01")]
+    for folder in folders:
+        (folder / "nerfstudio_models").mkdir(parents=True)
+        (folder / "config.yml").touch()
+    assert find_runs(tmp_path) == sorted(folders)
+    assert find_runs(tmp_path / "b") == sorted([folders[0], folders[2]])
+    assert find_runs(folders[0]) == [folders[0]]
+    for alone in (folders[0] / "config.yml", folders[0] / "nerfstudio_models", tmp_path / "nothing"):
+        assert find_runs(alone) == [alone]
+
+
 def test_what_is_no_run_is_one_sentence(tmp_path: Path, copy_run: CopyRun):
     with pytest.raises(
-        RecordingError, match=r"^\S+ holds no config\.yml; give the folder of a run, or its config\.yml\.$"
+        RecordingError, match=r"^\S+ holds no config\.yml; give the folder of a run, of several, or a config\.yml\.$"
     ):
         read_run(tmp_path)
     with pytest.raises(RecordingError, match=r"^\S+nothing does not exist; give"):

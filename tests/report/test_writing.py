@@ -7,7 +7,6 @@ import io
 import json
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from browsers import BROWSER, told_by
 from PIL import Image
 from small_runs import SMALL
 
@@ -29,10 +29,10 @@ from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.report import writing
 from enerf_ns.report.figures import Curve, error_against
 from enerf_ns.report.pictures import camera_path
+from enerf_ns.report.scoring import Scoring
 from enerf_ns.report.tables import history_csv
-from enerf_ns.report.writing import Scoring, write_report
+from enerf_ns.report.writing import write_report
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """A browser that draws pages without a screen."""
 
 PLOTS = {"error-against-seconds.png", "error-against-steps.png", "step.png"}
@@ -126,9 +126,14 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO((folder / "error-against-time.csv").read_text())))
 
 
+def without_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writing, "render_video", lambda pipeline, screen, path, output: output.write_bytes(b"film"))
+    monkeypatch.setattr(writing, "render_moving", lambda pipeline, screen, output: output.write_bytes(b"moving"))
+
+
 def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_path: Path, monkeypatch):
     """As runs of earlier versions are; the film itself is another test's."""
-    monkeypatch.setattr(writing, "render_video", lambda run, path, output: output.write_bytes(b"film"))
+    without_rendering(monkeypatch)
     folder = tmp_path / "new" / "report"
     entries = write_report([run], folder)
     assert json.loads((folder / "scores.json").read_text()) == entries
@@ -141,7 +146,7 @@ def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_
     assert json.loads((folder / "camera_path.json").read_text()) == camera_path(
         run.pipeline.datamanager.eval_dataset.cameras
     )
-    assert names(folder) == TEXTS | {"side-by-side.png", "camera_path.json", "video.mp4"}
+    assert names(folder) == TEXTS | {"side-by-side.png", "camera_path.json", "video.mp4", "moving.webp"}
     assert Image.open(folder / "side-by-side.png").size[0] > 1000
     assert rows_of(folder) == []
     page = page_of(folder)
@@ -149,8 +154,37 @@ def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_
     assert "after 2 steps" in (folder / "report.md").read_text()
 
 
+@pytest.mark.parametrize(
+    ("supervision", "protocol", "scores", "cell"),
+    [
+        ("events", "log-affine-set", {"brightness_scale": 0.67, "brightness_scale_expected": 0.8}, "0.670 (0.800)"),
+        ("events", "log-affine-set", {"brightness_scale": 0.67}, "0.670"),
+        (
+            "events+frames",
+            "log-affine-set",
+            {**{f"brightness_scale_{colour}": 0.5 for colour in ("red", "green")}, "brightness_scale_expected": 1.0},
+            "0.500 0.500 (1.000)",
+        ),
+        ("events", "eventnerf", {"brightness_scale": 0.67}, None),
+        ("frames", "log-affine-set", {"brightness_scale": 0.67}, None),
+    ],
+)
+def test_the_brightness_scale_stands_beside_what_it_should_be(
+    run: Run, tmp_path: Path, supervision: str, protocol: str, scores: dict[str, float], cell: str | None
+):
+    row = HistoryRow(16, 2.0, {}, {"psnr": 18.0, "brightness_offset": 1.0, **scores}, 3, final=True, protocol=protocol)
+    folder = copied(run, tmp_path / "run", [row], stored=False)
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.supervision = supervision
+    (folder / "config.yml").write_text(yaml.dump(config))
+    write_report([folder], tmp_path / "report")
+    text, cells = (tmp_path / "report/report.md").read_text(), page_of(tmp_path / "report").cells
+    assert (cell in cells) if cell else "brightness scale" not in cells
+    assert ("The brightness scale is the factor" in text) == (cell is not None)
+
+
 def test_a_large_video_is_beside_the_page(run: Run, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(writing, "render_video", lambda run, path, output: output.write_bytes(b"film"))
+    without_rendering(monkeypatch)
     monkeypatch.setattr(writing, "LARGEST_EMBEDDED_VIDEO", 3)
     write_report([run], tmp_path)
     assert Page((tmp_path / "report.html").read_text()).sources[-1] == "video.mp4"
@@ -321,12 +355,9 @@ def test_a_folder_that_cannot_be_made_is_said_before_anything_is_rendered(run: R
         write_report([run], tmp_path / "file" / "report")
 
 
-MEASURE = """<script>addEventListener("load", () => {
-  const seen = { width: innerWidth, page: document.documentElement.scrollWidth,
+MEASURE = """  const seen = { width: innerWidth, page: document.documentElement.scrollWidth,
     images: [...document.images].map(image => [image.complete, image.naturalWidth, image.clientWidth]),
-    rows: [...document.querySelectorAll("tr")].filter(row => row.clientHeight > 0).length };
-  const told = document.createElement("output"); told.id = "seen"; told.textContent = JSON.stringify(seen);
-  document.body.append(told); });</script></body>"""
+    rows: [...document.querySelectorAll("tr")].filter(row => row.clientHeight > 0).length };"""
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
@@ -334,16 +365,7 @@ MEASURE = """<script>addEventListener("load", () => {
 def test_a_browser_shows_the_page(moved: Path, crashed: Path, run: Run, tmp_path: Path, width: int):
     """With every picture; and nothing makes the page wider than a narrow window, such as the narrowest it opens."""
     write_report([moved, crashed, run, tmp_path / "nothing"], tmp_path / "report", video=False)
-    measured = tmp_path / "measured.html"
-    measured.write_text((tmp_path / "report/report.html").read_text().replace("</body>", MEASURE))
-    dom = subprocess.run(
-        [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}",
-         f"--window-size={width},1000", "--virtual-time-budget=10000", "--dump-dom", measured.as_uri()],
-        capture_output=True, text=True, check=True, timeout=120,
-    ).stdout  # fmt: skip
-    told = re.search(r'<output id="seen">(.*?)</output>', dom)
-    assert told, dom[-500:]
-    seen = json.loads(told[1])
+    seen = told_by(tmp_path / "report/report.html", MEASURE, width, tmp_path / "browser")
     assert len(seen["images"]) == 4 + 1, "four plots, and the pictures of the one run whose recording is there"
     assert all(complete and natural > 400 and shown > 300 for complete, natural, shown in seen["images"])
     assert seen["page"] <= seen["width"] and seen["rows"] == 5 + 4 + 4 + 3

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -10,16 +12,55 @@ import pytest
 from enerf_ns.scripts import cli
 
 
-@pytest.mark.parametrize(
-    "command", [[], *([name] for name in ("bench", "convert", "demo", "inspect", "reconstruct", "report", "simulate"))]
-)
-def test_every_command_has_a_help(command: list[str], monkeypatch, capsys: pytest.CaptureFixture[str]):
-    monkeypatch.setattr(sys, "argv", ["enerf", *command, "--help"])
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_a_help(command: str, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["enerf", command, "--help"])
     with pytest.raises(SystemExit) as end:
         cli.entrypoint()
     assert end.value.code == 0
+    assert f"usage: enerf {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"]])
+def test_alone_it_says_what_there_is(arguments: list[str], monkeypatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["enerf", *arguments])
+    cli.entrypoint()
     shown = capsys.readouterr().out
-    assert "usage: enerf" in shown and (command or all(name in shown for name in ("convert", "inspect", "simulate")))
+    commands = {file.stem.replace("_", "-") for file in Path(cli.__file__).parent.glob("*.py") if _has_a_command(file)}
+    assert commands == set(cli.COMMANDS)
+    assert all(f"\n  {name} " in shown for name in commands)
+
+
+def _has_a_command(file: Path) -> bool:
+    return "def main(self)" in file.read_text()
+
+
+def test_the_list_and_help_that_needs_no_format_load_neither_torch_nor_nerfstudio():
+    for arguments in ([], ["demo", "--help"], ["bench", "--help"], ["--version"], ["nonsense"]):
+        code = (
+            f"import sys; sys.argv = ['enerf', *{arguments}]\nfrom enerf_ns.scripts.cli import entrypoint\n"
+            "try: entrypoint()\nexcept SystemExit: pass\n"
+            "print([name for name in ('torch', 'nerfstudio', 'scipy') if name in sys.modules])"
+        )
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert run.stdout.splitlines()[-1] == "[]", arguments
+
+
+def test_the_version_is_that_of_the_package(monkeypatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["enerf", "--version"])
+    cli.entrypoint()
+    assert capsys.readouterr().out == f"enerf-ns {version('enerf-ns')}\n"
+
+
+@pytest.mark.parametrize("name", ["nonsense", "--nonsense", "Report"])
+def test_what_is_no_command_is_one_sentence(name: str, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["enerf", name, "more"])
+    with pytest.raises(SystemExit) as end:
+        cli.entrypoint()
+    assert end.value.code == 2
+    out, error = capsys.readouterr()
+    assert (out, error.count("\n")) == ("", 1)
+    assert error.startswith(f"enerf: There is no command {name}; choose one of bench, ")
 
 
 @pytest.mark.parametrize(
@@ -29,7 +70,9 @@ def test_every_command_has_a_help(command: list[str], monkeypatch, capsys: pytes
         (["convert", "nowhere", "--output-dir", "new"], "nowhere does not exist"),
         (["bench", "nothing"], "There is no experiment nothing; choose one of"),
         (["reconstruct", "nowhere", "--output-dir", "new"], "nowhere is not a folder"),
+        (["export", "mesh", "nowhere"], "nowhere does not exist"),
         (["report", "config.yml"], "config.yml does not exist"),
+        (["report", "."], "holds no config.yml; give the folder of a run, of several"),
         (["simulate", "shapes", "--output-dir", "new", "--duration", "0"], "--duration is 0.0, but must be"),
         (["simulate", "nothing", "--output-dir", "new"], "nothing is neither a preset"),
     ],
@@ -58,6 +101,7 @@ def test_what_stops_it_from_outside_is_told(error: BaseException, code: object, 
         raise error
 
     monkeypatch.setattr(cli.tyro, "cli", stopped)
+    monkeypatch.setattr(sys, "argv", ["enerf", "demo"])
     with pytest.raises(SystemExit) as end:
         cli.entrypoint()
     assert end.value.code == code

@@ -35,7 +35,7 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from enerf_ns.checkpoints import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -201,6 +201,9 @@ def test_a_preset_is_told_and_kept(call, tmp_path: Path, home: Path, capsys: pyt
     assert used.datamanager.dataparser.held_out_frame_indices == tuple(range(1, 40, 2))
     call("ns-eval", "--load-config", file, "--output-path", "scores.json", "--render-output-path", "pictures")
     assert len(list(Path("pictures").iterdir())) == 20
+    call("ns-render", "dataset", "--load-config", file, "--output-path", "renders", "--split", "train+test",
+         "--rendered-output-names", "gt-rgb")  # fmt: skip
+    assert [len(list(Path("renders", split).rglob("*.jpg"))) for split in ("train", "test")] == [21, 20]
 
 
 def test_a_preset_of_another_sequence_is_refused(home: Path):
@@ -209,15 +212,21 @@ def test_a_preset_of_another_sequence_is_refused(home: Path):
     assert "--preset eds00 selects from the frames 425 to 970" in " ".join(trained.stderr.split())
 
 
-def check_video(path: Path, frames: int, columns: int = 1) -> np.ndarray:
-    """A video of pictures side by side that can be decoded; its first frame, uint8 [height, width, 3].
+def check_rendered(path: Path, frames: int, columns: int = 1) -> np.ndarray:
+    """A video of pictures side by side as Nerfstudio makes it; its first frame, uint8 [height, width, 3].
 
     Its size is the sensor's within a pixel: Nerfstudio doubles the principal point of a path to get it.
     """
+    frame = check_video(path, frames)
+    assert abs(frame.shape[1] - columns * WIDTH) <= columns and abs(frame.shape[0] - HEIGHT) <= 1
+    return frame
+
+
+def check_video(path: Path, frames: int) -> np.ndarray:
+    """A video that can be decoded; its first frame, uint8 [height, width, 3]."""
     assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == frames
     reader = imageio_ffmpeg.read_frames(str(path))
     width, height = next(reader)["source_size"]  # type: ignore[index]
-    assert abs(width - columns * WIDTH) <= columns and abs(height - HEIGHT) <= 1
     frame = np.frombuffer(next(reader), np.uint8).reshape(height, width, 3)
     reader.close()
     return frame
@@ -240,12 +249,12 @@ def test_render_interpolate_finds_ffmpeg(run: Path, tmp_path: Path):
                      "--interpolation-steps", 3, "--rendered-output-names", "rgb", "depth", "accumulation", "normals",
                      cwd=tmp_path)  # fmt: skip
     assert rendered.returncode == 0, rendered.stdout + rendered.stderr
-    check_video(tmp_path / "video.mp4", frames=3 * (NUM_HELD_OUT - 1), columns=4)
+    check_rendered(tmp_path / "video.mp4", frames=3 * (NUM_HELD_OUT - 1), columns=4)
 
 
 def test_render_spiral(call, run: Path):
     call("ns-render", "spiral", "--load-config", run, "--output-path", "video.mp4", "--seconds", 0.5)
-    check_video(Path("video.mp4"), frames=12)
+    check_rendered(Path("video.mp4"), frames=12)
 
 
 def test_render_camera_path(call, run: Path):
@@ -272,7 +281,7 @@ def test_render_camera_path(call, run: Path):
     Path("path.json").write_text(json.dumps(camera_path))
     call("ns-render", "camera-path", "--load-config", run, "--camera-path-filename", "path.json",
          "--output-path", "video.mp4")  # fmt: skip
-    shown = check_video(Path("video.mp4"), frames=5) / 255.0
+    shown = check_rendered(Path("video.mp4"), frames=5) / 255.0
     rendered = pipeline.model.get_outputs_for_camera(camera)["rgb"].numpy()
     assert abs(shown.mean() - rendered.mean()) < 0.02, "the first picture is what the field shows there"
 
@@ -288,6 +297,17 @@ def test_render_dataset(call, run: Path):
     np.testing.assert_array_equal(frame, np.asarray(Image.open(recording / "images/00002.png")))
     with gzip.open("renders/test/raw-depth/00002.npy.gz") as file:
         assert (np.load(file) > 0).all()
+
+
+def test_render_dataset_downscaled(call, run: Path):
+    call("ns-render", "dataset", "--load-config", run, "--output-path", "renders", "--image-format", "png",
+         "--downscale-factor", 2, "--rendered-output-names", "rgb", "gt-rgb", "raw-gt-depth")  # fmt: skip
+    recording, size = yaml.load(run.read_text(), Loader=yaml.Loader).data, (WIDTH // 2, HEIGHT // 2)
+    assert Image.open("renders/test/rgb/00002.png").size == size
+    frame = Image.open(recording / "images/00002.png").convert("RGB").resize(size, Image.Resampling.HAMMING)
+    np.testing.assert_array_equal(np.asarray(Image.open("renders/test/gt-rgb/00002.png")), np.asarray(frame))
+    with gzip.open("renders/test/raw-gt-depth/00002.npy.gz") as file:
+        np.testing.assert_array_equal(np.load(file)[..., 0], np.load(recording / "depth/00002.npy")[1::2, 1::2])
 
 
 def test_export_point_cloud(call, run: Path):
@@ -326,8 +346,8 @@ def test_report(call, run: Path):
     (scores,) = json.loads(Path("report/scores.json").read_text()).values()
     assert scores["lpips"] is None and scores["psnr"] > 5 and 0 < scores["depth_rmse"] and 1 < scores["mean_depth"] < 4
     assert Image.open("report/side-by-side.png").size[0] > 1000
-    frame = check_video(Path("report/video.mp4"), frames=VIDEO_FRAMES, columns=2)
-    assert frame.shape == (HEIGHT, 2 * WIDTH, 3), "even sides, which every player can show"
+    frame = check_video(Path("report/video.mp4"), frames=VIDEO_FRAMES)
+    assert frame.shape[1] >= 2 * 480 and not np.any(np.array(frame.shape[:2]) % 2), "even sides, for every player"
     video = base64.b64encode(Path("report/video.mp4").read_bytes()).decode()
     assert f"data:video/mp4;base64,{video}" in Path("report/report.html").read_text()
 
@@ -347,7 +367,7 @@ def test_demo_on_a_recording_that_is_there_already(call, home: Path):
     assert {"psnr", "ssim", "lpips", "depth_rmse", "train_seconds", "events"} <= set(scores)
     assert scores["train_seconds"] > 0 and scores["events"] == simulated["num_events"]
     assert Image.open("demo/side-by-side.png").size[0] > 1000
-    check_video(Path("demo/video.mp4"), frames=VIDEO_FRAMES, columns=2)
+    check_video(Path("demo/video.mp4"), frames=VIDEO_FRAMES)
 
 
 def test_report_of_no_run_is_an_error(call):
@@ -404,7 +424,7 @@ def test_eval_without_frames(call, run_without_frames: Path):
 def test_render_without_frames(call, run_without_frames: Path):
     call("ns-render", "interpolate", "--load-config", run_without_frames, "--output-path", "video.mp4",
          "--interpolation-steps", 3)  # fmt: skip
-    check_video(Path("video.mp4"), frames=6)
+    check_rendered(Path("video.mp4"), frames=6)
     call("ns-render", "dataset", "--load-config", run_without_frames, "--output-path", "renders",
          "--rendered-output-names", "rgb", "gt-rgb")  # fmt: skip
     pictures = sorted(Path("renders/test/gt-rgb").iterdir())

@@ -5,14 +5,9 @@ from typing import Any
 import pytest
 import torch
 
+from enerf_ns.events.batch import EventBatch
 from enerf_ns.sensor.response import linlog, luma
-from enerf_ns.sensor.sensor_model import (
-    DEFAULT_CONTRAST_THRESHOLD,
-    GREY,
-    SensorModel,
-    SensorModelConfig,
-    thresholds_from_polarity,
-)
+from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
 
 
 def sensor(**changes: Any) -> SensorModel:
@@ -31,7 +26,8 @@ def test_measured_change_of_a_ramp(thresholds: tuple[float, float]):
     """A pixel that brightens, and then darkens, by 2.0 in log brightness, one event each time a threshold is passed."""
     rises, falls = int(2.0 / thresholds[0]), int(2.0 / thresholds[1])
     on, off, pixels = torch.tensor([rises, 0, rises]), torch.tensor([0, falls, falls]), torch.tensor([0, 1, 2])
-    changes = sensor(contrast_thresholds=thresholds).measured_change(on, off, pixels)
+    batch = EventBatch(pixels, torch.zeros(3), torch.ones(3), on, off)
+    changes = sensor(contrast_thresholds=thresholds).measured_change(batch)
     assert changes[0].item() == pytest.approx(2.0, abs=thresholds[0])
     assert changes[1].item() == pytest.approx(-2.0, abs=thresholds[1])
     assert changes[2].item() == pytest.approx(changes[0].item() + changes[1].item(), abs=1e-6)
@@ -67,19 +63,3 @@ def test_it_has_no_parameters_and_stores_nothing():
     grey, colour = sensor(), sensor(bayer_pattern="RGGB")
     assert not list(grey.parameters()) and not grey.state_dict() and not colour.state_dict()
     assert grey.mean_threshold == pytest.approx(0.275)
-
-
-def test_thresholds_balance_the_polarities():
-    on, off = thresholds_from_polarity(100, 141)
-    assert 100 * on == pytest.approx(141 * off)
-    assert (on + off) / 2 == pytest.approx(DEFAULT_CONTRAST_THRESHOLD)
-
-
-@pytest.mark.parametrize(("counts", "expected"), [((10**6, 1), (0.001, 0.499)), ((1, 10**6), (0.499, 0.001))])
-def test_thresholds_stay_those_of_a_sensor_however_few_events_one_polarity_has(counts, expected):
-    assert thresholds_from_polarity(*counts) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("counts", [(0, 0), (7, 0), (0, 7), (7, 7)])
-def test_thresholds_are_equal_where_polarities_are_or_one_is_missing(counts: tuple[int, int]):
-    assert thresholds_from_polarity(*counts) == (DEFAULT_CONTRAST_THRESHOLD, DEFAULT_CONTRAST_THRESHOLD)

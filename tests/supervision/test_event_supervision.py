@@ -99,7 +99,7 @@ def test_gradients_reach_both_instants(channels: int):
 def test_a_perfect_render_costs_nothing():
     pairs = batch([False] * 12)
     sensed = sensor()
-    measured = sensed.measured_change(pairs.on, pairs.off, pairs.pixels)
+    measured = sensed.measured_change(pairs)
     start = torch.full((12, 1), 0.3)
     end = sensed.response.inverse(sensed.response(start) + measured[:, None])
     torch.testing.assert_close(brightness_change(start, end, pairs, sensed), measured, rtol=0, atol=1e-5)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 CALL = (
-    "import os, shutil, sys; from enerf_ns.ffmpeg import make_ffmpeg_available; make_ffmpeg_available();"
+    "import os, shutil, sys; from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available; make_ffmpeg_available();"
     "print(shutil.which('ffmpeg'), 'imageio_ffmpeg' in sys.modules)"
 )
 

@@ -1,0 +1,311 @@
+"""Contrast thresholds from frames: what an event is worth in the log brightness of the frames of the same camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from scipy import sparse
+
+from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording, Frames
+
+DARKEST, BRIGHTEST = 20, 245
+"""Grey levels from and up to which pixels of frames are used: darker ones are rounded by more than 2.5 %, and not all
+responses are logarithms there; brighter ones may be saturated."""
+
+LUMA = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in what a grey sensor sees (ITU-R BT.601)."""
+
+NUM_STARTS = 24
+"""Most frames that others are compared to."""
+
+SAMPLED_PIXELS = 2**15
+"""Most pixels of a frame that are compared, evenly taken."""
+
+EVENTS_BETWEEN = 0.25
+"""Fewest events of a pixel on average between the frames that are compared: with fewer, hardly any tells something."""
+
+MOST_EVENTS = 8
+"""Most events of a pixel between two frames: over more, noise and the spread of thresholds weigh too much."""
+
+FEWEST_ROWS = 1000
+"""Fewest changes of a pixel between frames that thresholds are fitted to."""
+
+SHARES, GAPS = 4, (0.25, 1.0)
+"""How finely the place of a frame between two events is told: parts of the interval, and lengths of it as multiples of
+the time from frame to frame."""
+
+INSTANTS = 5
+"""Instants of an exposure at which events are counted."""
+
+MODEL_ERROR, BLURRED_ERROR = 0.03, 0.08
+"""Relative error that is always there, of sharp and of blurred frames; see `thresholds_from_frames`."""
+
+MOST_FRAMES = 200
+"""Most frames, successive ones, among which those are looked for that enclose an interval."""
+
+NEAREST_ROWS = 400
+"""Intervals of each polarity, those that frames enclose most closely, which a blind sensor's thresholds come from."""
+
+FEWEST_NEAREST = 50
+"""Fewest of them."""
+
+LARGEST_ERROR = 0.5
+"""Largest relative error of thresholds that are said to be measured."""
+
+
+def thresholds_from_frames(
+    recording: EventRecording, blind_for: int
+) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], str] | None:
+    """C_on and C_off by which events explain how log brightness changes from frame to frame.
+
+    Frames are taken as they are learnt from: linear, with the response that the recording states. A change is
+    C_on * (on events) - C_off * (off events), plus what the pixel had seen of its next event at the second frame, less
+    what it had at the first one. That rest is fitted with the thresholds, by the polarity of the events before and
+    after the frame and the frame's place between them: a pixel after an on event is more likely above what it
+    memorised than below. Noise and spread of thresholds flatten the fit; they do so more between frames that are twice
+    as far apart, and that difference is part of the error. On simulated recordings with known thresholds the mean is
+    right within 3 %, behind a low pass of 100 Hz within 5 %; from blurred frames within 10 %.
+
+    Of a sensor with a refractory period, changes are missed. What remains is each interval from the end of blindness to
+    the next event, in which brightness changes by one threshold: intervals that two frames enclose closely, in a
+    straight line to those that they enclose exactly. Half of the scatter is part of the error.
+
+    Args:
+        recording: Its index is made if it is not there yet; its sharp frames are taken, else the blurred ones, whose
+            events are counted at several instants of the exposure.
+        blind_for: The refractory period, ns; 0 for none.
+
+    Returns:
+        Values, standard errors, and half a sentence that says what they rest on. None without frames, where another
+        camera took them, where frames are too blurred for a blind sensor, or where they do not tell both thresholds.
+
+    Raises:
+        RecordingError: The file of a frame is missing or cannot be decoded.
+    """
+    frames = recording.frames
+    if frames is None and recording.reconstructed_by is None:
+        frames = recording.blurred_frames
+    if frames is None or frames.camera != recording.camera or frames.trajectory is not recording.trajectory:
+        return None
+    comparison = _Comparison(recording, index_events(recording), frames)
+    found = comparison.of_blind_sensor(blind_for) if blind_for else comparison.of_counts()
+    if found is None:
+        return None
+    values, errors, why = found
+    errors = np.hypot(errors, (MODEL_ERROR if comparison.is_sharp else BLURRED_ERROR) * values)
+    least, largest = CONTRAST_THRESHOLD_LIMITS
+    if not (np.all((values > least) & (values < largest)) and np.all(errors < LARGEST_ERROR * values)):
+        return None
+    return values, errors, why
+
+
+@dataclass(frozen=True)
+class _Between:
+    """Where an instant lies between the events of some pixels."""
+
+    is_known: Bool[np.ndarray, " pixels"]
+    """Whether there are events before and after."""
+    number: Int64[np.ndarray, " pixels"]
+    """Events up to the instant; `rises` of them are on events."""
+    rises: Int64[np.ndarray, " pixels"]
+    since: Int64[np.ndarray, " pixels"]
+    """Time since the last event, ns; `until` is that to the next one."""
+    until: Int64[np.ndarray, " pixels"]
+    after_on: Bool[np.ndarray, " pixels"]
+    """Whether the last event is an on event; `before_on`, whether the next one is."""
+    before_on: Bool[np.ndarray, " pixels"]
+
+
+class _Comparison:
+    """Some pixels of frames beside their events."""
+
+    def __init__(self, recording: EventRecording, index: EventIndex, frames: Frames):
+        first, last = index.span
+        during = np.flatnonzero((frames.exposed[:, 0] >= first) & (frames.exposed[:, 1] <= last))
+        self.recording, self.index, self.frames = recording, index, frames.subset(during)
+        num_pixels = len(index.offsets) - 1
+        self.pixels = torch.arange(0, num_pixels, -(-num_pixels // SAMPLED_PIXELS) | 1)
+        steps = np.diff(self.frames.times)
+        self.step = float(np.median(steps)) if len(steps) else 0.0
+        self.rate = len(index) / num_pixels / max(last - first, 1)
+        kind, _, offset = (recording.response or "").partition(":")
+        self.offset = float(offset) if kind == "logarithm" else 0.0
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether frames are of an instant, as far as is known."""
+        return not np.ptp(self.frames.exposed, axis=1).any()
+
+    def of_counts(self) -> tuple[np.ndarray, np.ndarray, str] | None:
+        """Thresholds of a sensor that sees all changes."""
+        number = len(self.frames.times)
+        if not self.step or not self.rate:
+            return None
+        lag = max(int(np.ceil(EVENTS_BETWEEN / (self.rate * self.step))), 1)
+        if number <= 2 * lag:
+            return None
+        starts = np.unique(np.linspace(0, number - 1 - 2 * lag, NUM_STARTS).round().astype(int))
+        num_columns = 2 + 4 * SHARES * (len(GAPS) + 1)
+        squares = np.zeros((len(starts), 2, num_columns, num_columns))
+        products = np.zeros((len(starts), 2, num_columns))
+        rows = 0
+        for i, start in enumerate(starts.tolist()):
+            one, other, third = (self._seen(start + step * lag, lag * self.step) for step in range(3))
+            for j, after in enumerate((other, third)):
+                table, change = _difference(one, after)
+                squares[i, j], products[i, j] = (table.T @ table).toarray(), table.T @ change
+                rows += table[:, :2].getnnz(axis=1).astype(bool).sum() if j == 0 else 0
+        if rows < FEWEST_ROWS:
+            return None
+
+        def fit(chosen: np.ndarray, lags: slice) -> np.ndarray:
+            square, product = squares[chosen][:, lags].sum((0, 1)), products[chosen][:, lags].sum((0, 1))
+            return np.linalg.lstsq(square, product, rcond=1e-10)[0][:2]
+
+        each, both = np.arange(len(starts)), slice(0, 2)
+        values = fit(each, both)
+        without = np.stack([fit(np.delete(each, i), both) for i in each])
+        jackknife = np.sqrt((len(each) - 1) / len(each) * ((without - without.mean(0)) ** 2).sum(0))
+        trend = np.abs(fit(each, slice(0, 1)) - fit(each, slice(1, 2)))
+        why = f"{rows:,} changes of log brightness from frame to frame are explained best by events of these thresholds"
+        return values, np.hypot(jackknife, trend), why
+
+    def of_blind_sensor(self, blind_for: int) -> tuple[np.ndarray, np.ndarray, str] | None:
+        """Thresholds of a sensor with a refractory period (ns)."""
+        first = max(len(self.frames.times) - MOST_FRAMES, 0) // 2
+        times = self.frames.times[first : first + MOST_FRAMES]
+        if not self.is_sharp or len(times) < 2:
+            return None
+        brightness = np.stack([self._log_brightness(first + number) for number in range(len(times))])
+        rows = []
+        for number, time in enumerate(times[:-1].tolist()):
+            seen = _between(self.index, self.pixels, time)
+            ends = time + seen.until
+            following = np.searchsorted(times, ends, side="right") - 1
+            chosen = np.flatnonzero(seen.is_known & (seen.since >= blind_for) & (following > number))
+            last = following[chosen]
+            change = brightness[last, chosen] - brightness[number, chosen]
+            known = np.isfinite(change)
+            chosen, last, change = chosen[known], last[known], change[known]
+            sign = np.where(seen.before_on[chosen], 1.0, -1.0)
+            late, early = seen.since[chosen] - blind_for, ends[chosen] - times[last]
+            rows.append(np.stack([sign, sign * change, late * 1e-6, early * 1e-6]))
+        sign, change, late, early = np.concatenate(rows, axis=1)
+        rises, falls = (_enclosed(change[sign == s], late[sign == s], early[sign == s]) for s in (1, -1))
+        if rises is None or falls is None:
+            return None
+        (on, on_error, num_on), (off, off_error, num_off) = rises, falls
+        why = (
+            f"frames enclose {num_on:,} intervals before an on event and {num_off:,} before an off event closely, and "
+            "log brightness changes by so much in them"
+        )
+        return np.array([on, off]), np.array([on_error, off_error]), why
+
+    def _seen(self, number: int, gap: float) -> tuple[np.ndarray, list[_Between], np.ndarray]:
+        """Log brightness of a frame, where its instants lie between events, and the columns of the rest at each."""
+        opens, closes = self.frames.exposed[number].tolist()
+        places = (np.arange(INSTANTS) + 0.5) / INSTANTS if closes > opens else np.array([0.5])
+        instants = (opens + (closes - opens) * places).astype(np.int64)
+        between = [_between(self.index, self.pixels, int(instant)) for instant in instants]
+        columns = []
+        for seen in between:
+            length = seen.since + seen.until
+            share = np.minimum(SHARES * seen.since // np.maximum(length, 1), SHARES - 1)
+            gaps = np.digitize(length, np.array(GAPS) * gap)
+            columns.append(((2 * seen.after_on + seen.before_on) * SHARES + share) * (len(GAPS) + 1) + gaps)
+        return self._log_brightness(number), between, np.stack(columns)
+
+    def _log_brightness(self, number: int) -> Float64[np.ndarray, " pixels"]:
+        """What the pixels see in a frame; not a number where it is too dark or too bright."""
+        image = load_image(self.frames.filenames[number]).astype(float).reshape(len(self.index.offsets) - 1, -1)
+        image = image[self.pixels.numpy()]
+        pattern = self.recording.bayer_pattern
+        if image.shape[1] == 1:
+            level = image[:, 0]
+        elif pattern is None:
+            level = image @ LUMA
+        else:
+            x, y = self.pixels.numpy() % self.index.width, self.pixels.numpy() // self.index.width
+            channel = np.array(["RGB".index(letter) for letter in pattern])[2 * (y % 2) + x % 2]
+            level = np.take_along_axis(image, channel[:, None], axis=1)[:, 0]
+        usable = (level >= DARKEST) & (level <= BRIGHTEST)
+        return np.where(usable, np.log(np.where(usable, level, 1) / 255 + self.offset), np.nan)
+
+
+def _between(index: EventIndex, pixels: torch.Tensor, time: int) -> _Between:
+    number = index.count_until(pixels, torch.full_like(pixels, time))
+    first, stop = index.offsets[pixels], index.offsets[pixels + 1]
+    last, following = (first + number - 1).clamp(min=0), (first + number).clamp(max=len(index) - 1)
+
+    def rises_until(event: torch.Tensor) -> torch.Tensor:
+        return torch.where(event >= 0, index.positives[event.clamp(min=0)], 0).long()
+
+    known = (number > 0) & (first + number < stop)
+    rises = torch.where(number > 0, rises_until(last) - rises_until(first - 1), 0)
+    columns = (
+        number,
+        rises,
+        time - index.times[last],
+        index.times[following] - time,
+        rises_until(last) > rises_until(last - 1),
+        rises_until(following) > rises_until(following - 1),
+    )
+    return _Between(known.numpy(), *(column.numpy() for column in columns))
+
+
+def _difference(
+    one: tuple[np.ndarray, list[_Between], np.ndarray], other: tuple[np.ndarray, list[_Between], np.ndarray]
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """On events, minus off events and rests between two frames as rows of a matrix, and the changes they explain."""
+    (before, first, rests), (after, second, later_rests) = one, other
+    change = after - before
+    known = np.isfinite(change) & np.logical_and.reduce([seen.is_known for seen in [*first, *second]])
+
+    def mean(seen: list[_Between], name: str) -> np.ndarray:
+        return np.mean([getattr(instant, name) for instant in seen], axis=0)
+
+    number, rises = (mean(second, name) - mean(first, name) for name in ("number", "rises"))
+    chosen = np.flatnonzero(known & (number <= MOST_EVENTS))
+    count, instants = len(chosen), len(rests)
+    ones = np.full(instants * count, 1 / instants)
+    values = [rises[chosen], rises[chosen] - number[chosen], ones, -ones]
+    columns = [np.zeros(count), np.ones(count), 2 + later_rests[:, chosen].ravel(), 2 + rests[:, chosen].ravel()]
+    places = np.tile(np.arange(count), 2 + 2 * instants)
+    shape = count, 2 + 4 * SHARES * (len(GAPS) + 1)
+    matrix = sparse.csr_matrix((np.concatenate(values), (places, np.concatenate(columns).astype(int))), shape)
+    return matrix, change[chosen]
+
+
+def _enclosed(change: np.ndarray, late: np.ndarray, early: np.ndarray) -> tuple[float, float, int] | None:
+    """Threshold, its error and on how many intervals it rests.
+
+    Args:
+        change: Of log brightness between two frames within an interval, in the direction of its event.
+        late: From the begin of the interval to the first frame, ms.
+        early: From the second frame to the event, ms.
+    """
+    if len(change) < FEWEST_NEAREST:
+        return None
+    nearest = np.argsort(late + early)[:NEAREST_ROWS]
+    change, table = change[nearest], np.stack([np.ones(len(nearest)), late[nearest], early[nearest]], axis=1)
+
+    def fit(chosen: np.ndarray) -> float:
+        """Least absolute deviations, by reweighting: some brightness changes fast beside a frame."""
+        rows, wanted, weights = table[chosen], change[chosen], np.ones(len(chosen))
+        for _ in range(30):
+            found = np.linalg.lstsq(rows * weights[:, None], wanted * weights, rcond=None)[0]
+            weights = 1 / np.sqrt(np.maximum(np.abs(wanted - rows @ found), 1e-3))
+        return float(found[0])
+
+    generator = np.random.default_rng(0)
+    value = fit(np.arange(len(change)))
+    bootstrap = np.std([fit(generator.integers(0, len(change), len(change))) for _ in range(30)])
+    slopes = np.linalg.lstsq(table, change, rcond=None)[0]
+    scatter = float(np.std(change - table @ slopes))
+    return value, float(np.hypot(bootstrap, 0.5 * scatter)), len(change)

@@ -1,0 +1,295 @@
+"""What a recording tells of its sensor before anything is learnt: each parameter with its standard error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from scipy.optimize import nnls
+
+from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.frame_contrast import thresholds_from_frames
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording
+
+ASSUMED_THRESHOLD = 0.25
+"""Mean threshold assumed where no frames tell it. Events fix brightness only up to this factor."""
+
+SAMPLED_EVENTS = 2**21
+"""Most events looked at, those of pixels evenly taken."""
+
+FEWEST_INTERVALS = 10_000
+"""Fewest intervals between events of one pixel that tell whether there is a refractory period."""
+
+SHARP_EDGE = 1.25
+"""Largest ratio between quantiles of intervals that a refractory period explains; see `refractory_period`. In simulated
+recordings without one, quantiles differ by 1.3 to 2 and polarities by 2.5 to 6 times, with one by at most 1.06."""
+
+PERIOD_ERROR = 0.01
+"""Relative error of the refractory period that is always there; see `refractory_period`."""
+
+WINDOWS = tuple(round(8 * 2 ** (i / 2)) for i in range(24))
+"""Numbers of successive events of a pixel that are summed; over fewer, the scene alone makes the sum grow."""
+
+FEWEST_PIXELS, LEAST_SHARE = 200, 0.1
+"""Fewest pixels that have as many events as are summed, and least share of those that have any: the few that have most
+are odd ones."""
+
+BALANCE_ERROR = 0.01
+"""Relative error of thresholds by counts that is always there: leak adds on events, a scene may brighten as a whole."""
+
+SPREAD_ERROR = 0.08
+"""Relative error of the spread of thresholds that is always there: what it makes of a scene's own growth."""
+
+GROUPS = 16
+"""Parts of the sensor, each left out once (jackknife) to find errors."""
+
+TOLD = 3.0
+"""Standard errors from 0 at which a parameter is told from 0."""
+
+LEAST_GROWTH = 0.5
+"""Least share of the variance of the longest sums that a spread of thresholds must make to be told: a scene makes it
+grow by some tenths."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of the sensor as the recording tells it."""
+
+    value: float
+    error: float
+    """Its standard error, in the same unit; infinite where it is only assumed."""
+    why: str
+    """Half a sentence that can follow "because", with the numbers it rests on."""
+
+
+def refractory_period(index: EventIndex) -> Estimate | None:
+    """For how long (ns) a pixel is blind after an event, where events show it.
+
+    The shortest intervals between events of one pixel then end at a sharp edge (low quantiles lie close together),
+    which is the same whether brightness went on or turned back; without it, intervals in which it turns back are
+    several times as long. Quantiles and not the shortest interval, which jitter and read-out set. The edge is taken
+    from the quantiles of 0.1 and 0.3 %, in a straight line to 0 %; its error is half of what lies between it and the
+    quantile of 1 %, and 1 %: even the fastest brightness takes some time to the next threshold.
+
+    Args:
+        index: On the CPU.
+
+    Returns:
+        None where events show none: there is no edge, or too few of them are closer together than the motion makes
+        them.
+    """
+    times, is_on, follows = _sampled(index)
+    intervals, turns = np.diff(times)[follows], (is_on[1:] != is_on[:-1])[follows]
+    if len(intervals) < FEWEST_INTERVALS or min(turns.sum(), (~turns).sum()) < FEWEST_INTERVALS / 10:
+        return None
+    lowest, low, high = np.quantile(intervals, [0.001, 0.003, 0.01]).tolist()
+    onward, back = (float(np.quantile(intervals[chosen], 0.01)) for chosen in (~turns, turns))
+    if lowest <= 0 or high > SHARP_EDGE * lowest or not 1 / SHARP_EDGE < back / onward < SHARP_EDGE:
+        return None
+    edge = max(lowest - 0.5 * (low - lowest), 0.0)
+    return Estimate(
+        float(edge),
+        math.hypot((high - edge) / 2, PERIOD_ERROR * edge),
+        f"99 % of {len(intervals):,} intervals between events of a pixel are longer than {_ms(high)} and 99.9 % longer "
+        f"than {_ms(lowest)}, whether brightness goes on ({_ms(onward)}) or turns back ({_ms(back)})",
+    )
+
+
+def share_closer(index: EventIndex, time: int) -> float:
+    """Share of the intervals between successive events of one pixel that are shorter than a time (ns)."""
+    times, _, follows = _sampled(index)
+    return float((np.diff(times)[follows] < time).mean()) if follows.any() else 0.0
+
+
+def contrast_thresholds(recording: EventRecording, blind: bool) -> tuple[Estimate, Estimate, bool]:
+    """C_on and C_off, and whether their mean was measured.
+
+    From frames of the camera of the events, where there are some (`thresholds_from_frames`). Else their mean is
+    `ASSUMED_THRESHOLD`, and the errors are of what is told, their ratio: over a long recording every pixel's changes
+    nearly cancel, so (on events) C_on = (off events) C_off. Not so for a sensor with a refractory period, which misses
+    more of the faster changes, and these are not as often of either polarity (counts are off by 1.2 to 1.65 in
+    simulated recordings): then the thresholds are assumed to be equal, with infinite error.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        blind: Whether the sensor has a refractory period.
+
+    Raises:
+        RecordingError: The events or a frame cannot be used.
+    """
+    index = index_events(recording)
+    blind_for = 0
+    if blind:
+        period = refractory_period(index)
+        blind_for = recording.refractory_period or (round(period.value) if period else 0)
+    measured = thresholds_from_frames(recording, blind_for)
+    if measured is not None:
+        values, errors, why = measured
+        on, off = (Estimate(float(value), float(error), why) for value, error in zip(values, errors, strict=True))
+        return on, off, True
+    num_on, num_off = index.num_positive, len(index) - index.num_positive
+    if blind or not num_on or not num_off:
+        why = "the sensor misses changes while it is blind" if blind else "the events are of one polarity"
+        assumed = Estimate(ASSUMED_THRESHOLD, math.inf, f"{why}, so that both thresholds are assumed to be equal")
+        return assumed, assumed, False
+    counts = index.offsets.diff().numpy()
+    rises = torch.where(index.offsets > 0, index.positives[(index.offsets - 1).clamp(min=0)], 0)
+    on_of_pixels = rises.diff().numpy()
+    edges = np.linspace(0, len(counts), GROUPS + 1).astype(int)[:-1]
+    of_groups = np.stack([np.add.reduceat(column, edges) for column in (on_of_pixels, counts - on_of_pixels)])
+    without = of_groups.sum(1, keepdims=True) - of_groups
+    values = _balanced(np.array([num_on]), np.array([num_off]))[:, 0]
+    errors = np.hypot(_jackknife(_balanced(*without)), BALANCE_ERROR * values)
+    why = f"{num_on:,} on and {num_off:,} off events darken as much as they brighten; the mean is assumed"
+    on, off = (Estimate(float(value), float(error), why) for value, error in zip(values, errors, strict=True))
+    return on, off, False
+
+
+def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]) -> Estimate | None:
+    """Relative standard deviation of thresholds from pixel to pixel.
+
+    It makes the variance of a pixel's sum of events grow with the square of their number, while the brightness of a
+    scene is bounded and noise makes it grow with the number.
+
+    Args:
+        index: On the CPU.
+        contrast_thresholds: C_on and C_off; only their ratio matters.
+
+    Returns:
+        None where it cannot be told from 0, or from what a sensor with a refractory period misses.
+    """
+    if refractory_period(index) is not None:
+        return None
+    growth = _growth(index, contrast_thresholds, with_spread=True)
+    if growth is None:
+        return None
+    square, error = growth.values[2], growth.errors[2]
+    share = square * growth.squares / growth.variance
+    if square < TOLD * error or share < LEAST_GROWTH:
+        return None
+    spread = math.sqrt(square)
+    why = (
+        f"the sums of {growth.longest} successive events of a pixel vary by {growth.variance:.3g} squared thresholds, "
+        f"{100 * share:.0f} % of it in step with the square of their number"
+    )
+    return Estimate(spread, math.hypot(error / (2 * spread), SPREAD_ERROR * spread), why)
+
+
+def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float]) -> Estimate:
+    """Growth of the variance of a pixel's sum of events with each of them, in squared mean thresholds: the part that
+    grows with their number as a random walk does.
+
+    Args:
+        index: On the CPU.
+        contrast_thresholds: C_on and C_off; only their ratio matters.
+
+    Returns:
+        0 with infinite error where pixels have too few events.
+    """
+    growth = _growth(index, contrast_thresholds, with_spread=refractory_period(index) is None)
+    if growth is None:
+        return Estimate(0.0, math.inf, f"hardly any pixels have {WINDOWS[2]} events")
+    why = (
+        f"the sums of {WINDOWS[0]} to {growth.longest} successive events of a pixel vary by {growth.first:.3g} to "
+        f"{growth.variance:.3g} squared thresholds"
+    )
+    return Estimate(float(growth.values[1]), float(growth.errors[1]), why)
+
+
+@dataclass(frozen=True)
+class _Growth:
+    """How the variance of sums of events grows with their number, in squared mean thresholds."""
+
+    values: Float64[np.ndarray, "3"]
+    """What does not grow, what each event adds, and squared spread."""
+    errors: Float64[np.ndarray, "3"]
+    longest: int
+    """Number of events of the longest sums."""
+    first: float
+    """Variance of the shortest sums."""
+    variance: float
+    """Variance of the longest sums."""
+    squares: float
+    """What a squared spread of 1 would add to it."""
+
+
+def _growth(index: EventIndex, contrast_thresholds: tuple[float, float], with_spread: bool) -> _Growth | None:
+    """Sums of the number of events of `WINDOWS`, and a fit with coefficients of at least 0 to their variance."""
+    on, off = np.array(contrast_thresholds) / np.mean(contrast_thresholds)
+    times, is_on, follows = _sampled(index)
+    pixel = np.concatenate([[0], np.cumsum(~follows)])
+    ups = np.concatenate([[0.0], np.cumsum(is_on)])
+    numbers = np.arange(len(times) + 1)
+    total = on * ups - off * (numbers - ups)
+    drift = total[-1] / len(times)
+    per_pixel = np.bincount(pixel)
+    group = pixel * GROUPS // len(per_pixel)
+    fewest = max(FEWEST_PIXELS, LEAST_SHARE * len(per_pixel))
+    rows = []
+    for length in WINDOWS:
+        if np.count_nonzero(per_pixel >= length) < fewest:
+            break
+        within = pixel[length - 1 :] == pixel[: len(pixel) - length + 1]
+        begin = np.flatnonzero(within)
+        sums = total[begin + length] - total[begin] - drift * length
+        rises = ups[begin + length] - ups[begin]
+        squares = (on * rises) ** 2 + (off * (length - rises)) ** 2
+        of = group[begin]
+        rows.append([np.bincount(of, weights, GROUPS) for weights in (None, sums**2, squares)])
+    if len(rows) < 3:
+        return None
+    table = np.array(rows)  # windows, (number, squared sums, squares), groups
+
+    def fit(table: np.ndarray) -> np.ndarray:
+        number, variance, squares = table.sum(2).T
+        variance, squares = variance / number, squares / number
+        columns = np.stack([np.ones(len(number)), WINDOWS[: len(number)], squares * with_spread], axis=1)
+        weights = 1 / (1 + variance)  # events are whole thresholds
+        return nnls(columns * weights[:, None], variance * weights)[0]
+
+    number, variance, squares = table.sum(2).T
+    without = np.stack([fit(np.delete(table, i, axis=2)) for i in range(GROUPS)], axis=1)
+    return _Growth(
+        values=fit(table),
+        errors=_jackknife(without),
+        longest=WINDOWS[len(rows) - 1],
+        first=float(variance[0] / number[0]),
+        variance=float(variance[-1] / number[-1]),
+        squares=float(squares[-1] / number[-1]),
+    )
+
+
+def _sampled(
+    index: EventIndex,
+) -> tuple[Int64[np.ndarray, " events"], Bool[np.ndarray, " events"], Bool[np.ndarray, " events-1"]]:
+    """Times of the events of some pixels, whether each is an on event, and whether it follows one of its pixel."""
+    step = -(-len(index) // SAMPLED_EVENTS) | 1
+    pixels = torch.arange(0, len(index.offsets) - 1, step)
+    first, counts = index.offsets[pixels], index.offsets[pixels + 1] - index.offsets[pixels]
+    ends = counts.cumsum(0)
+    chosen = torch.repeat_interleave(first - ends + counts, counts) + torch.arange(int(ends[-1]))
+    before = torch.where(chosen > 0, index.positives[(chosen - 1).clamp(min=0)], 0)
+    is_on = (index.positives[chosen] > before).numpy()
+    pixel = torch.repeat_interleave(pixels, counts)
+    return index.times[chosen].numpy(), is_on, (pixel[1:] == pixel[:-1]).numpy()
+
+
+def _balanced(num_on: Int64[np.ndarray, " sets"], num_off: Int64[np.ndarray, " sets"]) -> Float64[np.ndarray, "2 sets"]:
+    """C_on and C_off under which events of both polarities cancel; neither below the least that there is."""
+    both, least = 2 * ASSUMED_THRESHOLD, CONTRAST_THRESHOLD_LIMITS[0]
+    on = np.clip(both * num_off / np.maximum(num_on + num_off, 1), least, both - least)
+    return np.stack([on, both - on])
+
+
+def _jackknife(without: Float64[np.ndarray, "values groups"]) -> Float64[np.ndarray, " values"]:
+    """Standard errors of values from what they are without each group."""
+    groups = without.shape[1]
+    return np.sqrt((groups - 1) / groups * ((without - without.mean(1, keepdims=True)) ** 2).sum(1))
+
+
+def _ms(time: float) -> str:
+    return f"{time * 1e-6:.4g} ms"

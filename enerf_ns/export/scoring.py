@@ -1,0 +1,126 @@
+"""How well a surface fits a reference, in metres, over what cameras saw of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.files import read_json
+from enerf_ns.simulator.event_sensor import SensorSettings
+from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scenes import Scene
+from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.view import scene_of
+
+NEAR = 0.05
+"""Distance in metres within which a surface counts as right."""
+
+SAMPLES = 100_000
+"""Points, at most, whose distances are measured in each direction."""
+
+
+@dataclass(frozen=True)
+class SurfaceScores:
+    """Distances between a surface and the reference, metres."""
+
+    accuracy: float
+    """Mean distance from the surface to the reference."""
+    completeness: float
+    """Mean distance from the reference, as far as some camera saw it, to the surface."""
+    chamfer: float
+    """Mean of both."""
+    accurate_share: float
+    """Share of the surface within `NEAR` of the reference."""
+    complete_share: float
+    """Share of the reference, as far as some camera saw it, within `NEAR` of the surface."""
+
+    def as_dict(self) -> dict[str, float]:
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return (
+            f"accuracy {self.accuracy:.4f} m, completeness {self.completeness:.4f} m, Chamfer {self.chamfer:.4f} m; "
+            f"within {NEAR:g} m: {self.accurate_share:.1%} of the surface, {self.complete_share:.1%} of what was seen "
+            "of the reference"
+        )
+
+
+def simulated_scene(recording: Path) -> Scene | None:
+    """The scene that a recording was simulated of; None where it was not, or not of a scene."""
+    file = recording / "simulation.json"
+    about = read_json(file) if file.is_file() else {}
+    if not about.get("scene"):
+        return None
+    settings = SimulationSettings(about["scene"], sensor=SensorSettings(seed=about.get("sensor", {}).get("seed", 0)))
+    return None if settings.pictures else scene_of(settings, [])
+
+
+def surface_scores(
+    surface: trimesh.Trimesh | trimesh.PointCloud,
+    scene: Scene,
+    camera: Camera,
+    poses: Sequence[Float64[np.ndarray, "3 4"]],
+) -> SurfaceScores:
+    """Compares a surface with a scene.
+
+    Args:
+        surface: In metres, in the axes of the scene; not empty.
+        scene: The reference.
+        camera: That saw the scene, without distortion.
+        poses: That it had; camera to world, OpenCV axes, metres.
+    """
+    generator = np.random.default_rng(0)
+    reference = trimesh.Trimesh(scene.triangles.reshape(-1, 3), np.arange(3 * len(scene.triangles)).reshape(-1, 3))
+    if isinstance(surface, trimesh.Trimesh):
+        points = np.asarray(trimesh.sample.sample_surface(surface, SAMPLES, seed=0)[0])
+    else:
+        points = generator.permutation(np.asarray(surface.vertices))[:SAMPLES]
+    seen = generator.permutation(seen_points(scene, camera, poses))[:SAMPLES]
+    to_reference, to_surface = distances(points, reference), distances(seen, surface)
+    accuracy, completeness = float(to_reference.mean()), float(to_surface.mean())
+    return SurfaceScores(
+        accuracy,
+        completeness,
+        (accuracy + completeness) / 2.0,
+        float((to_reference <= NEAR).mean()),
+        float((to_surface <= NEAR).mean()),
+    )
+
+
+def seen_points(
+    scene: Scene, camera: Camera, poses: Sequence[Float64[np.ndarray, "3 4"]]
+) -> Float64[np.ndarray, "points 3"]:
+    """What cameras see of a scene: the points that their pixels show, one for each centimetre, metres."""
+    renderer, directions = Renderer(scene, camera), camera.pixel_directions()
+    points = []
+    for pose in poses:
+        depth = renderer.depth(pose)
+        hit = depth > 0
+        points.append((directions * depth[..., None])[hit] @ pose[:, :3].T + pose[:, 3])
+    every = np.concatenate(points)
+    return every[np.unique(np.floor(100.0 * every).astype(np.int64), axis=0, return_index=True)[1]]
+
+
+def distances(
+    points: Float[np.ndarray, "points 3"], surface: trimesh.Trimesh | trimesh.PointCloud
+) -> Float[np.ndarray, " points"]:
+    """Distance of each point to a mesh, or to the nearest point of a cloud."""
+    if isinstance(surface, trimesh.PointCloud):
+        return KDTree(surface.vertices).query(points)[0]
+    import open3d
+
+    tensor: Any = open3d.core.Tensor
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        tensor(np.asarray(surface.vertices, np.float32)),
+        tensor(np.asarray(surface.faces, np.uint32)),
+    )
+    return scene.compute_distance(tensor(points.astype(np.float32))).numpy()

@@ -1,0 +1,251 @@
+"""Moving pictures of a trained run, as one likes to look at them: large enough, and bright enough for a screen."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from nerfstudio.cameras.camera_paths import get_path_from_json
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from rich.progress import track
+from torch import Tensor
+
+from enerf_ns.dataparsers.errors import OutputError
+from enerf_ns.dataparsers.event_index import OFF_COLOUR, ON_COLOUR, event_picture
+from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Correction
+from enerf_ns.evaluation.views import HeldOutView
+
+MIDDLE_GREY = 0.5
+"""What the median brightness is shown as, where the screen's gamma suffices for that."""
+SCREEN_GAMMA = 2.2
+"""Gamma of screens: linear brightness to the power of 1 / 2.2 is what they show as it is. What was encoded by a camera
+already, and so is bright enough, takes less."""
+VIDEO_SIDE, MOVING_SIDE = 480, 240
+"""Width of each picture of the video at least, and of those that move, pixels."""
+MOVING_FRAMES, MOVING_MS, MOVING_PIXELS = 40, 90, 160 * 120
+"""Pictures that move, for how long each is shown, and how many pixels of each are rendered at most."""
+GAP = 8
+"""Pixels between pictures side by side."""
+
+
+@dataclass(frozen=True)
+class Screen:
+    """How brightness and depth are shown."""
+
+    correct: Callable[[Tensor], Tensor]
+    """From the field's linear brightness to that of the frames."""
+    exponent: float
+    """Power to which brightness is shown."""
+    near: float
+    far: float
+    """Depths in metres at the ends of the colours."""
+
+    @classmethod
+    def of(cls, views: Sequence[HeldOutView], depth_range: tuple[float, float]) -> Screen:
+        """One on which these views, with their brightness as the field has it, look well."""
+        correct = _correction(views)
+        shown = torch.cat([correct(view.rendered.double()).clamp(0, 1).flatten() for view in views])
+        median = float(shown[shown.isfinite()].median().clamp(1e-6, 0.999)) if shown.isfinite().any() else MIDDLE_GREY
+        exponent = min(max(math.log(MIDDLE_GREY) / math.log(median), 1 / SCREEN_GAMMA), 1.0)
+        return cls(correct, exponent, *depth_range)
+
+    def brightness(self, rendered: Float[Tensor, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """The field's linear brightness as it is shown."""
+        corrected = self.correct(rendered.cpu().double()).nan_to_num().clamp(0.0, 1.0)
+        return (255.0 * corrected**self.exponent).round().byte().numpy()
+
+    def depth(self, metres: Float[Tensor, "height width 1"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Depth in metres in the colours of viridis."""
+        from matplotlib import colormaps
+
+        share = (metres[..., 0].cpu().nan_to_num(self.far).numpy() - self.near) / max(self.far - self.near, 1e-9)
+        return np.rint(255.0 * colormaps["viridis"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
+
+    @property
+    def gamma(self) -> str:
+        """What is done to brightness, in words."""
+        return f"brightness^(1/{1 / self.exponent:.1f})" if self.exponent < 1 else "brightness"
+
+
+def _correction(views: Sequence[HeldOutView]) -> Callable[[Tensor], Tensor]:
+    """The default protocol's fit of the views to their frames; where there is none, the brightest becomes white."""
+    framed = [view for view in views if view.recorded is not None and view.rendered.isfinite().all()]
+    fit = PROTOCOLS[DEFAULT_PROTOCOL].fit
+    if framed and fit is not None:
+        columns = 3 if framed[0].colour_filter else 1
+        x = torch.cat([view.rendered.double().reshape(-1, columns) for view in framed])
+        y = torch.cat([view.recorded.double().reshape(-1, columns) for view in framed if view.recorded is not None])
+        fitted = fit(x, y)
+        if isinstance(fitted, Correction):
+            return fitted.apply
+    brightness = torch.cat([view.rendered.double().flatten() for view in views])
+    finite = brightness[brightness.isfinite()].numpy()
+    white = max(float(np.quantile(finite, 0.99)) if len(finite) else 1.0, 1e-9)
+    return lambda rendered: rendered / white
+
+
+def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], output: Path) -> None:
+    """Render a flight: brightness beside depth, each `VIDEO_SIDE` wide at least, with a scale of metres.
+
+    Args:
+        pipeline: Of a trained run.
+        screen: How it is shown.
+        path: As the viewer saves it.
+        output: The .mp4 file, which is whole afterwards, or as it was before.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    cameras = get_path_from_json(path)
+    width = max(VIDEO_SIDE, int(path["render_width"]))
+    strip = _strip(width, {screen.gamma: None, "depth, metres": (screen.near, screen.far)})
+
+    def pictures() -> Iterator[np.ndarray]:
+        for number in track(range(len(cameras)), "Rendering the video", console=CONSOLE, transient=True):
+            rays = cameras[number : number + 1].to(pipeline.device).generate_rays(camera_indices=0, keep_shape=True)
+            yield _below([_scaled(side, width) for side in _sides(pipeline, screen, rays)], strip)
+
+    with _partial(output) as partial:
+        _write_mp4(partial, pictures(), int(path["fps"]))
+
+
+def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None:
+    """Render what the event camera saw: events, brightness and depth along the recorded path, a small animated WebP.
+
+    Args:
+        pipeline: Of a trained run.
+        screen: How it is shown.
+        output: The .webp file, which is whole afterwards, or as it was before.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    manager = pipeline.datamanager
+    recording = manager.recording
+    index, camera = index_events(recording), recording.camera
+    first, last = index.span
+    step = math.ceil(math.sqrt(camera.width * camera.height / MOVING_PIXELS))
+    rows, columns = torch.arange(step // 2, camera.height, step), torch.arange(step // 2, camera.width, step)
+    pixels = (rows[:, None] * camera.width + columns).flatten().to(pipeline.device)
+    posed = manager.event_camera_without_distortion
+    strip = _strip(
+        MOVING_SIDE,
+        {"events": ((ON_COLOUR, "brighter"), (OFF_COLOUR, "darker")), "render": None, "depth, metres":
+         (screen.near, screen.far)},
+    )  # fmt: skip
+    pictures = []
+    times = np.linspace(first, last, MOVING_FRAMES + 2).astype(np.int64)[1:-1]
+    for time in track(times.tolist(), "Rendering the moving picture", console=CONSOLE, transient=True):
+        rays = posed.rays(pixels, torch.full_like(pixels, time)).reshape((len(rows), len(columns)))
+        sides = [event_picture(index, camera, time), *_sides(pipeline, screen, rays)]
+        pictures.append(Image.fromarray(_below([_scaled(side, MOVING_SIDE) for side in sides], strip)))
+    content = io.BytesIO()
+    pictures[0].save(
+        content, "webp", save_all=True, append_images=pictures[1:], duration=MOVING_MS, loop=0, quality=55, method=4
+    )
+    write_whole(output, content.getvalue())
+
+
+@torch.no_grad()
+def _sides(pipeline: EnerfPipeline, screen: Screen, rays: RayBundle) -> list[np.ndarray]:
+    """Brightness and depth along rays (height, width)."""
+    pipeline.eval()
+    outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+    scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
+    metres = outputs["depth"] / rays.metadata["directions_norm"] / scale
+    return [screen.brightness(outputs["rgb"]), screen.depth(metres)]
+
+
+def _scaled(picture: UInt8[np.ndarray, "height width 3"], width: int) -> UInt8[np.ndarray, "tall wide 3"]:
+    """The picture at another width, by Lanczos where it grows."""
+    size = width, round(picture.shape[0] * width / picture.shape[1])
+    return cv2.resize(picture, size, interpolation=cv2.INTER_LANCZOS4 if width > picture.shape[1] else cv2.INTER_AREA)
+
+
+def _below(sides: Sequence[np.ndarray], strip: np.ndarray) -> np.ndarray:
+    """Pictures side by side on white above what explains them, with sides even, as players want them."""
+    gap = np.full((len(sides[0]), GAP, 3), 255, np.uint8)
+    row = np.concatenate([part for side in sides for part in (gap, side)][1:], axis=1)
+    whole = np.concatenate([row, strip], axis=0)
+    return np.pad(whole, ((0, len(whole) % 2), (0, whole.shape[1] % 2), (0, 0)), constant_values=255)
+
+
+def _strip(width: int, explained: dict[str, Any]) -> UInt8[np.ndarray, "height wide 3"]:
+    """What explains pictures side by side, of this width each: a title, and below it colours or a scale of depth."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    number, dpi, height = len(explained), 100, 54
+    total = number * width + (number - 1) * GAP
+    figure = Figure(figsize=(total / dpi, height / dpi), dpi=dpi)
+    for place, (title, what) in enumerate(explained.items()):
+        left = (place * (width + GAP) + 0.5 * width) / total
+        figure.text(left, 0.92, title, ha="center", va="top", fontsize=9)
+        if what is not None and isinstance(what[0], float):
+            bar = figure.add_axes((left - 0.4 * width / total, 0.36, 0.8 * width / total, 0.16))
+            figure.colorbar(ScalarMappable(Normalize(*what), "viridis"), cax=bar, orientation="horizontal")
+            bar.tick_params(labelsize=8, pad=1, length=2)
+        elif what is not None:
+            handles = [Patch(facecolor="#{:02x}{:02x}{:02x}".format(*colour), label=name) for colour, name in what]
+            figure.legend(handles=handles, loc="upper center", bbox_to_anchor=(left, 0.62), ncols=2, fontsize=8,
+                          frameon=False, borderpad=0, handlelength=1)  # fmt: skip
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3]
+    fitting = np.full((height, total, 3), 255, np.uint8)
+    fitting[: len(drawn), : drawn.shape[1]] = drawn[:height, :total]
+    return fitting
+
+
+@contextmanager
+def _partial(output: Path) -> Iterator[Path]:
+    """A file beside another, in place of which it comes where the block ends well; it is gone otherwise."""
+    partial = output.with_name(f".{output.stem}.partial-{os.getpid()}{output.suffix}")
+    try:
+        yield partial
+        partial.replace(output)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write_mp4(file: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
+    """Encodes pictures of one size as H.264.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    from imageio_ffmpeg import write_frames
+
+    unwritten = OutputError(f"{file.parent} could not take a video; make room on the disk.")
+    first = next(pictures)
+    video = write_frames(
+        str(file), first.shape[1::-1], fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet"
+    )
+    video.send(None)
+    try:
+        video.send(np.ascontiguousarray(first).tobytes())
+        for picture in pictures:
+            video.send(np.ascontiguousarray(picture).tobytes())
+        video.close()
+    except OSError as error:
+        raise unwritten from error
+    if not cv2.VideoCapture(str(file)).isOpened():
+        raise unwritten

@@ -1,0 +1,109 @@
+"""Contrast thresholds of single pixels, learned beside a field: how far each pixel's lie from the sensor's."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int, Int64
+from torch import Tensor, nn
+
+from enerf_ns.precision import full_precision
+
+SOLVED_EVERY = 50
+"""Observations from one time that the map is solved to the next."""
+
+FIRST_SPREAD = 0.05
+"""Relative standard deviation of thresholds from pixel to pixel that is assumed before anything is observed."""
+
+SMALLEST_SPREAD = 1e-3
+"""Least standard deviation that is believed, so that a map can grow again."""
+
+LARGEST_DEVIATION = 0.5
+"""Largest deviation of a threshold, as a share of the sensor's."""
+
+
+class ThresholdMap(nn.Module):
+    """Relative deviations of the on and off thresholds of each pixel, by a regression that runs along with training.
+
+    What a pair of instants of a pixel should change by is C_on (1 + d_on) n_on - C_off (1 + d_off) n_off; the residual
+    between what a field renders and the same with d = 0 is linear in both deviations. Each pixel keeps the normal
+    equations of its own two numbers, robustly weighted as the Huber loss is, and in inverse proportion to the variance
+    of residuals at that time; an observation counts as the square of its number, so that those of a field that was not
+    yet learnt fade. A ridge draws the deviations to 0: its strength is the deviations' own variance, which is estimated
+    from all pixels (empirical Bayes), so that a sensor whose pixels are alike gets none. The mean over the pixels stays
+    0, since that belongs to the sensor's thresholds.
+
+    Nothing here has a gradient or a learning rate; everything is stored with the run.
+
+    Args:
+        num_pixels: Of the sensor.
+    """
+
+    products: Tensor
+    deviations: Tensor
+    variance: Tensor
+    spread: Tensor
+    number: Tensor
+
+    def __init__(self, num_pixels: int):
+        super().__init__()
+        self.register_buffer("products", torch.zeros(num_pixels, 5))
+        self.register_buffer("deviations", torch.zeros(num_pixels, 2))
+        self.register_buffer("variance", torch.ones(()))
+        self.register_buffer("spread", torch.full((2,), FIRST_SPREAD))
+        self.register_buffer("number", torch.zeros(()))
+        self._observed = 0
+
+    def factors(self, pixels: Int64[Tensor, " pairs"]) -> Float[Tensor, "pairs 2"]:
+        """What the on and off thresholds of pixels are multiplied by."""
+        return 1.0 + self.deviations[pixels]
+
+    @torch.no_grad()
+    @full_precision
+    def observe(
+        self,
+        pixels: Int64[Tensor, " pairs"],
+        on: Int[Tensor, " pairs"],
+        off: Int[Tensor, " pairs"],
+        residual: Float[Tensor, " pairs"],
+        shares: tuple[float | Tensor, float | Tensor],
+    ) -> None:
+        """Takes in what a step showed, but for residuals that are not finite.
+
+        Args:
+            pixels: Of pairs, y * width + x.
+            on, off: Numbers of their events.
+            residual: Rendered change of log brightness less what the events add up to at the sensor's thresholds, in
+                mean thresholds.
+            shares: The sensor's on and off threshold, in mean thresholds.
+        """
+        is_finite = residual.isfinite()
+        residual, on, off = (torch.where(is_finite, column, 0) for column in (residual, on, off))
+        a, b = shares[0] * on, -shares[1] * off
+        left = (residual - (torch.stack([a, b], dim=-1) * self.deviations[pixels]).sum(dim=-1)).abs()
+        weight = 1.0 / left.clamp(min=1.0)
+        self.number += 1.0
+        now = (weight * left.square()).mean()
+        self.variance += (now - self.variance) / self.number.clamp(max=100.0)
+        weight = weight * self.number.square() / self.variance.clamp(min=1e-6)
+        columns = torch.stack([a * a, a * b, b * b, a * residual, b * residual], dim=-1)
+        self.products.index_add_(0, pixels, weight[:, None] * columns)
+        if not self._observed:
+            self._observed = int(self.number) - 1  # also of a run that goes on
+        self._observed += 1
+        if self._observed % SOLVED_EVERY == 0:
+            self._solve()
+
+    def _solve(self) -> None:
+        """Deviations from the normal equations, and how far they spread from what they and their errors are."""
+        aa, ab, bb, ar, br = (self.products / self.number.square()).unbind(dim=-1)
+        prior = self.spread.square().reciprocal()
+        aa, bb = aa + prior[0], bb + prior[1]
+        determinant = aa * bb - ab * ab
+        solved = torch.stack([bb * ar - ab * br, aa * br - ab * ar], dim=-1) / determinant[:, None]
+        errors = torch.stack([bb, aa], dim=-1) / determinant[:, None]
+        seen = (self.products[:, [0, 2]] > 0.0).float()
+        share = seen / seen.sum(dim=0).clamp(min=1.0)
+        solved = seen * (solved - (share * solved).sum(dim=0))
+        spread = (share * (solved.square() + errors)).sum(dim=0).sqrt()
+        self.spread.copy_(torch.where(seen.any(dim=0), spread, self.spread).clamp(min=SMALLEST_SPREAD))
+        self.deviations.copy_(solved.clamp(-LARGEST_DEVIATION, LARGEST_DEVIATION))

@@ -1,0 +1,77 @@
+"""Thresholds from frames, of waves with known ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from waves import CAMERA, events_of_waves, recording_of
+
+from enerf_ns.dataparsers.frame_contrast import thresholds_from_frames
+from enerf_ns.dataparsers.recording import EventRecording
+
+FRAMES = np.arange(1, 40) * 25_000_000
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
+    return recording_of(events_of_waves((0.28, 0.2), 1.0), tmp_path_factory.mktemp("waves"), FRAMES)
+
+
+def test_both_thresholds_are_measured(recording: EventRecording):
+    found = thresholds_from_frames(recording, 0)
+    assert found is not None
+    values, errors, _ = found
+    np.testing.assert_allclose(values, (0.28, 0.2), rtol=0.04)
+    assert np.all(np.abs(values - (0.28, 0.2)) < 2 * errors) and np.all(errors < 0.1 * values)
+
+
+def test_thresholds_are_in_the_units_of_the_stated_response(recording: EventRecording):
+    """An offset of 0.5 makes log brightness vary less, by the same events."""
+    plain = thresholds_from_frames(recording, 0)
+    flat = thresholds_from_frames(replace(recording, response="logarithm:0.5"), 0)
+    assert plain is not None and flat is not None and np.all(flat[0] < 0.6 * plain[0])
+
+
+def test_intervals_between_frames_tell_the_thresholds_of_a_blind_sensor(tmp_path: Path):
+    frames = np.arange(1, 100) * 10_000_000
+    recording = recording_of(events_of_waves((0.28, 0.2), 1.0, 20_000_000), tmp_path, frames)
+    found = thresholds_from_frames(recording, 20_000_000)
+    assert found is not None
+    values, errors, why = found
+    assert np.all(np.abs(values - (0.28, 0.2)) < 2 * errors) and np.all(errors < 0.3 * values)
+    assert "enclose" in why
+
+
+def test_frames_of_another_camera_and_reconstructed_ones_tell_nothing(recording: EventRecording):
+    frames = recording.frames
+    assert frames is not None and thresholds_from_frames(replace(recording, frames=None), 0) is None
+    other = replace(frames, camera=replace(CAMERA, cx=20.0))
+    assert thresholds_from_frames(replace(recording, frames=other), 0) is None
+    reconstructed = replace(recording, frames=None, blurred_frames=frames, reconstructed_by="E2VID")
+    assert thresholds_from_frames(reconstructed, 0) is None
+    assert thresholds_from_frames(replace(reconstructed, reconstructed_by=None), 0) is not None
+
+
+def test_few_or_dark_frames_tell_nothing(recording: EventRecording, tmp_path: Path):
+    assert recording.frames is not None
+    for number in (0, 1, 2):
+        few = replace(recording, frames=recording.frames.subset(np.arange(number)) if number else None)
+        assert thresholds_from_frames(few, 0) is None
+    events = events_of_waves((0.28, 0.2), 0.3)
+    dark = recording_of(events, tmp_path, FRAMES[:10])
+    assert dark.frames is not None
+    for file in dark.frames.filenames:
+        Image.fromarray((np.asarray(Image.open(file)) // 16).astype(np.uint8)).save(file)
+    assert thresholds_from_frames(dark, 0) is None
+
+
+def test_unrelated_frames_have_large_errors_or_tell_nothing(recording: EventRecording):
+    frames = recording.frames
+    assert frames is not None
+    shuffled = np.random.default_rng(0).permutation(len(frames.times))
+    mixed = replace(frames, filenames=tuple(frames.filenames[i] for i in shuffled))
+    assert thresholds_from_frames(replace(recording, frames=mixed), 0) is None

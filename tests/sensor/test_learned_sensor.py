@@ -1,0 +1,258 @@
+"""What is learned of a sensor, from pixels whose brightness is known in closed form, without a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.recording import Events
+from enerf_ns.enerf_config import SENSOR_LEARNING_RATES
+from enerf_ns.events.batch import EventBatch
+from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
+from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
+
+WIDTH, HEIGHT, SECONDS = 8, 8, 2.0
+PIXELS = WIDTH * HEIGHT
+RESPONSE = "logarithm:0.001"
+
+
+def brightness(pixels: Tensor, times: Tensor, delays: Tensor | None = None) -> Tensor:
+    """Of pixels at times (ns), float64: log brightness swings, of each pixel by itself."""
+    seconds = 1e-9 * (times.double() + (0.0 if delays is None else delays))
+    phase, rate = pixels.double() * 2.4, 1.5 + 0.03 * pixels.double()
+    return torch.exp(-1.6 + 1.3 * torch.sin(2.0 * torch.pi * rate * seconds + phase))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    index: EventIndex
+    thresholds: np.ndarray
+    """Of each pixel, shape (2, pixels)."""
+
+
+@cache
+def recorded(**settings: Any) -> Recorded:
+    """Events of the simulated sensor; it sees a picture every 0.2 ms."""
+    settings = {"contrast_thresholds": (0.2, 0.2), "response": RESPONSE, **settings}
+    all_pixels = torch.arange(PIXELS)
+    times = np.arange(0, int(SECONDS * 1e9), 200_000)
+
+    def picture(time: int) -> np.ndarray:
+        return brightness(all_pixels, torch.full_like(all_pixels, int(time))).numpy().reshape(HEIGHT, WIDTH)
+
+    sensor = EventSensor(SensorSettings(**settings), picture(0), 0)
+    parts = [sensor.advance(picture(time), int(time)) for time in times[1:]] + [sensor.finish()]
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in "xytp")
+    index = EventIndex.from_events(Events(*columns), WIDTH, HEIGHT)
+    return Recorded(index, sensor.contrast_thresholds.reshape(2, PIXELS))
+
+
+def model(**changes: Any) -> SensorModel:
+    settings: dict[str, Any] = {
+        "contrast_thresholds": (0.2, 0.2), "response": RESPONSE, "refractory_period_ns": 0, "bayer_pattern": GREY,
+        "width": WIDTH, "height": HEIGHT,
+    }  # fmt: skip
+    return SensorModelConfig(**settings | changes).setup().double()
+
+
+def seen(sensor: SensorModel, batch: EventBatch) -> tuple[Tensor, Tensor]:
+    """What the pixels of a batch see at both instants, shape (pairs, 1)."""
+    delays = sensor.blind_after(batch.start, batch.end)
+    if delays is not None:
+        delays[batch.silent] = 0.0
+    return (
+        brightness(batch.pixels, batch.start, delays)[:, None],
+        brightness(batch.pixels, batch.end)[:, None],
+    )
+
+
+class Drawn:
+    """Draws batches of a recording, as training does."""
+
+    def __init__(self, index: EventIndex, seed: int, mode: Any = "successor"):
+        self._pairs = EventPairSampler(index, mode, max_distance=10)
+        self._silent = SilentPixelSampler(index, 0, int(SECONDS * 1e9) - 1, 10_000_000, 10_000_000)
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def batch(self, sensor: SensorModel) -> EventBatch:
+        pairs = self._pairs.sample(512, self._generator, sensor.refractory_period if sensor.lags else None)
+        return pairs.with_silent(self._silent.sample(128, self._generator, sensor.refractory_period))
+
+
+def learn(sensor: SensorModel, index: EventIndex, steps: int = 600, mode: Any = "successor") -> SensorModel:
+    """Trains the sensor alone, with the learning rates of the method, which fall to a tenth."""
+    groups = [{"params": group, "lr": SENSOR_LEARNING_RATES[name]} for name, group in sensor.get_param_groups().items()]
+    adam = torch.optim.Adam(groups) if groups else None
+    drawn = Drawn(index, 0, mode)
+    supervision = EventSupervision("huber", 1.0, 0.1, 0.0)
+    for step in range(steps):
+        batch = drawn.batch(sensor)
+        start, end = seen(sensor, batch)
+        sensor.observe(brightness_change(start, end, batch, sensor).detach(), batch)
+        if adam is not None:
+            for group, (name, _) in zip(adam.param_groups, sensor.get_param_groups().items(), strict=True):
+                group["lr"] = SENSOR_LEARNING_RATES[name] * 0.1 ** (step / steps)
+            adam.zero_grad()
+            torch.stack([*supervision.losses(start, end, batch, sensor).values()]).sum().backward()
+            adam.step()
+    return sensor
+
+
+def test_the_ratio_of_the_thresholds_is_learned():
+    sensor = learn(model(learn_threshold_ratio=True), recorded(contrast_thresholds=(0.234, 0.166)).index)
+    on, off = (float(threshold.detach()) for threshold in map(torch.as_tensor, sensor.contrast_thresholds))
+    assert on / off == pytest.approx(0.234 / 0.166, rel=0.01)
+    assert 0.5 * (on + off) == pytest.approx(0.2, rel=1e-6)
+
+
+def test_also_behind_a_refractory_period_where_counts_mislead():
+    index = recorded(contrast_thresholds=(0.234, 0.166), refractory_period=8_000_000).index
+    sensor = learn(model(learn_threshold_ratio=True, refractory_period_ns=8_000_000), index)
+    on, off = (float(torch.as_tensor(threshold).detach()) for threshold in sensor.contrast_thresholds)
+    assert on / off == pytest.approx(0.234 / 0.166, rel=0.02)
+
+
+def test_the_mean_of_the_thresholds_is_learned_where_brightness_is_known():
+    sensor = learn(model(learn_mean_threshold=True), recorded(contrast_thresholds=(0.3, 0.3)).index, steps=900)
+    assert float(sensor.mean_threshold) == pytest.approx(0.3, rel=0.01)
+
+
+def test_the_leak_rate_is_learned():
+    sensor = learn(model(learn_leak_rate=True), recorded(leak_rate=2.0).index)
+    assert float(sensor.leak_rate) == pytest.approx(2.0, rel=0.05)
+
+
+def test_the_cutoff_frequency_is_learned():
+    sensor = learn(model(learn_cutoff_frequency=True), recorded(cutoff_frequency=60.0).index)
+    assert sensor.cutoff_frequency == pytest.approx(60.0, rel=0.1)
+
+
+def test_the_refractory_period_is_learned():
+    index = recorded(refractory_period=8_000_000).index
+    sensor = learn(model(refractory_period_ns=6_000_000, learn_refractory_period=True), index)
+    assert sensor.log_refractory_period is not None
+    assert float(sensor.log_refractory_period.exp()) == pytest.approx(8e6, rel=0.02)
+
+
+def test_the_response_is_learned():
+    """A logarithm with an offset that is large, from one that has nearly none; thresholds tell the unit."""
+    index = recorded(response="logarithm:0.2", contrast_thresholds=(0.1, 0.1)).index
+    sensor = learn(model(learn_response=True, learn_mean_threshold=True), index, steps=1200)
+    levels = torch.linspace(0.07, 0.7, 50, dtype=torch.float64)
+    learned = sensor.response(levels).detach() / float(sensor.mean_threshold)
+    true = torch.log(levels + 0.2) / 0.1
+    difference = learned - true
+    assert float(difference.std() / true.std()) < 0.03
+    before = model().response(levels)
+    assert float((before / before.std() - true / true.std()).std()) > 0.1
+
+
+def test_thresholds_of_single_pixels_are_learned():
+    made = recorded(threshold_spread=0.06)
+    sensor = learn(model(learn_threshold_map=True), made.index, steps=200)
+    assert sensor.threshold_map is not None
+    for polarity in range(2):
+        found = sensor.threshold_map.deviations[:, polarity].numpy()
+        assert np.corrcoef(found, made.thresholds[polarity])[0, 1] > 0.95
+    assert sensor.threshold_map.spread.tolist() == pytest.approx([0.06, 0.06], rel=0.3)
+
+
+def test_pixels_that_are_alike_stay_so():
+    sensor = learn(model(learn_threshold_map=True), recorded().index, steps=200)
+    assert sensor.threshold_map is not None
+    assert float(sensor.threshold_map.deviations.abs().max()) < 0.01
+
+
+def test_a_map_goes_on_from_where_it_was_stored():
+    """It is solved at the same steps, and is the same, as one that was never stored."""
+    generator = torch.Generator().manual_seed(3)
+    whole = model(learn_threshold_map=True).threshold_map
+    assert whole is not None
+    going_on = whole
+    for number in range(120):
+        pixels = torch.randint(PIXELS, (64,), generator=generator)
+        ones = torch.ones(64, dtype=torch.long)
+        residual = 0.1 * torch.randn(64, generator=generator)
+        if number == 70:
+            going_on = model(learn_threshold_map=True).threshold_map
+            assert going_on is not None
+            going_on.load_state_dict(whole.state_dict())
+        for each in {whole, going_on}:
+            each.observe(pixels, ones, 0 * ones, residual, (1.0, 1.0))
+    assert going_on is not whole and whole.deviations.any()
+    torch.testing.assert_close(going_on.deviations, whole.deviations, rtol=0, atol=0)
+
+
+def test_a_residual_that_is_not_finite_teaches_nothing():
+    taught, other = (model(learn_threshold_map=True).threshold_map for _ in range(2))
+    assert taught is not None and other is not None
+    pixels, ones = torch.arange(4), torch.ones(4, dtype=torch.long)
+    taught.observe(pixels, ones, 0 * ones, torch.tensor([0.1, torch.nan, torch.inf, 0.2]), (1.0, 1.0))
+    other.observe(pixels, ones * torch.tensor([1, 0, 0, 1]), 0 * ones, torch.tensor([0.1, 0.0, 0.0, 0.2]), (1.0, 1.0))
+    assert taught.products[0, 3] > 0.0
+    torch.testing.assert_close(taught.products, other.products)
+
+
+def test_what_a_lag_hides_is_found_from_the_rates_of_events():
+    """Changes of brightness between events of a slow pixel, on average within a tenth of a threshold."""
+    sensor = model(cutoff_frequency=60.0)
+    batch = Drawn(recorded(cutoff_frequency=60.0).index, 1).batch(sensor)
+    fired = batch.fired
+    errors = {}
+    for name, considered in {"with": sensor, "without": model()}.items():
+        change = brightness_change(*seen(considered, batch), batch, considered)[fired]
+        errors[name] = float((change - considered.measured_change(batch)[fired]).square().mean().sqrt()) / 0.2
+    assert errors["with"] < 0.1 < 0.4 < errors["without"]
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "threshold_ratio": {"learn_threshold_ratio": True},
+    "mean_threshold": {"learn_mean_threshold": True},
+    "refractory_period": {"learn_refractory_period": True, "refractory_period_ns": 3_000_000},
+    "response": {"learn_response": True},
+    "bandwidth": {"learn_cutoff_frequency": True, "cutoff_frequency": 40.0},
+    "leak_rate": {"learn_leak_rate": True, "leak_rate": 0.5},
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_gradients_are_those_of_finite_differences(name: str):
+    sensor = model(**PARTS[name])
+    ((found, (parameter,)),) = sensor.get_param_groups().items()
+    assert found == name
+    index = recorded(cutoff_frequency=60.0, refractory_period=3_000_000, leak_rate=1.0).index
+    batch = Drawn(index, 2, "partner").batch(sensor)
+
+    def loss() -> Tensor:  # not that in units of the mean threshold, which is held while it is learned
+        change = brightness_change(*seen(sensor, batch), batch, sensor) - sensor.measured_change(batch)
+        return change.square().mean()
+
+    (gradient,) = torch.autograd.grad(loss(), parameter)
+    direction = torch.linspace(1.0, 2.0, parameter.numel(), dtype=torch.float64).view_as(parameter)
+    with torch.no_grad():
+        step = 1e-3 * direction
+        parameter += step
+        above = loss()
+        parameter -= 2.0 * step
+        slope = (above - loss()) / 2e-3
+    assert float((gradient * direction).sum()) == pytest.approx(float(slope), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_what_is_learned_is_stored(name: str):
+    sensor, other = model(**PARTS[name]), model(**PARTS[name])
+    with torch.no_grad():
+        for parameter in sensor.parameters():
+            parameter += 0.1
+    other.load_state_dict(sensor.state_dict())
+    for a, b in zip(sensor.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
