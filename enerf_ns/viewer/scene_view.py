@@ -12,6 +12,7 @@ import viser.transforms as vtf
 from jaxtyping import Float64
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer.render_state_machine import RenderAction
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
@@ -179,7 +180,8 @@ class SceneView(ViewerControl):
         pose = self._manager.train_dataset.cameras.camera_to_worlds[self._middle].cpu().double().numpy()
         back = pose[:, 2]
         self._turn(client, pose[:, 3] + BEHIND * self._depth * back, pose[:, 3] - self._depth * back, self._up)
-        client.camera.on_update(self._fit)
+        client.camera._state.camera_cb.clear()  # of Nerfstudio's callback, for which see ours
+        client.camera.on_update(self._moved)
         self.viewer.update_step(self.viewer.step)
         renderer.start()
 
@@ -190,6 +192,18 @@ class SceneView(ViewerControl):
             client.camera.up_direction = up
             client.camera.position = position * VISER_NERFSTUDIO_SCALE_RATIO
             client.camera.look_at = target * VISER_NERFSTUDIO_SCALE_RATIO
+
+    def _moved(self, view: viser.CameraHandle) -> None:
+        """Renders for a browser that says where it is.
+
+        Handles are heard in threads of their own, so that it may have gone since. Nerfstudio's own callback then fails
+        with viser's lock in hand, which nobody gives back: no message is sent any more, and Python does not end.
+        """
+        renderer = self.viewer.render_statemachines.get(view.client.client_id)
+        if renderer is not None:
+            self._fit(view)
+            self.viewer.last_move_time = time.time()
+            renderer.action(RenderAction("move", self.viewer.get_camera_state(view.client)))
 
     def _fit(self, view: viser.CameraHandle) -> None:
         """Has a view show all that the sensor sees, also where panels make it narrow."""

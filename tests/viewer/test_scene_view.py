@@ -159,6 +159,15 @@ def test_camera_paths_are_not_kept_with_the_recording(recording: Path, tmp_path:
     assert not pipeline.datamanager.get_datapath().is_relative_to(recording)
 
 
+def test_a_browser_that_goes_while_it_moves_leaves_the_viewer_at_work(viewer: Viewer, client: Client):
+    (handle,) = viewer.viser_server.get_clients().values()
+    client.close()
+    wait_for(lambda: not viewer.render_statemachines)
+    for callback in list(handle.camera._state.camera_cb):  # a message that is heard late
+        callback(handle.camera)
+    wait_for(lambda: not viewer.viser_server._websock_server._atomic_lock.locked(), 10.0)
+
+
 def test_what_changes_nothing_is_not_shown(client: Client):
     hidden = {
         message["id"]: not message["updates"]["visible"]
