@@ -202,7 +202,7 @@ class SceneView(ViewerControl):
         renderer = self.viewer.render_statemachines.get(view.client.client_id)
         if renderer is not None:
             self._fit(view)
-            self.viewer.last_move_time = time.time()
+            self.viewer.last_move_time = time.time()  # type: ignore - starts as an int
             renderer.action(RenderAction("move", self.viewer.get_camera_state(view.client)))
 
     def _fit(self, view: viser.CameraHandle) -> None:
