@@ -200,6 +200,31 @@ def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float])
     return Estimate(float(growth.values[1]), float(growth.errors[1]), why)
 
 
+def errors_of_learning(index: EventIndex) -> dict[str, float]:
+    """Standard errors with which events can tell a sensor's parameters to who knows all else, roughly.
+
+    Each event tells by how much brightness changed to about one threshold, independently of the others. So the ratio of
+    thresholds shows as 2 / sqrt(events); a leak as the square root of their number over the time that all pixels were
+    watched (as any rate); and a delay as a shift by a threshold in the median interval between a pixel's events,
+    divided by sqrt(events).
+
+    Args:
+        index: On the CPU.
+
+    Returns:
+        Of the threshold ratio, relative; of the leak rate, on events a second; of the delay, ms.
+    """
+    root = math.sqrt(len(index))
+    watched = 1e-9 * int((index.offsets.diff() > 0).sum()) * int(index.times.max() - index.times.min())
+    times, _, follows = _sampled(index)
+    interval = 1e-6 * float(np.median(np.diff(times)[follows])) if follows.any() else math.inf
+    return {
+        "threshold_ratio": 2.0 / root,
+        "leak_rate": root / watched if watched else math.inf,
+        "delay": interval / root,
+    }
+
+
 @dataclass(frozen=True)
 class _Growth:
     """How the variance of sums of events grows with their number, in squared mean thresholds."""

@@ -26,6 +26,7 @@ from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.sensor_estimates import (
     Estimate,
     contrast_thresholds,
+    errors_of_learning,
     noise_per_event,
     refractory_period,
     threshold_spread,
@@ -82,6 +83,10 @@ MOST_NOISE = 0.1
 
 RANGE_OF_NOISE = 2.9
 """Range of the sums of a random walk that one in a hundred exceeds, in standard deviations at its end."""
+
+LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "delay": 1.0}
+"""Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that a
+recording is too short to tell keeps what it starts from."""
 
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""
@@ -419,33 +424,41 @@ class _Resolver:
             return assumed[0].value, assumed[1].value
 
         on, off = self.use(name, from_recording)
-        ratio = self.use(
-            "model.sensor.learn_threshold_ratio", lambda: learns and assumed is not None and bool(blind)
-        )  # where pixels are never blind, counts tell it better: on slider_depth what was learned drifted by a fifth
-        mean = self.use("model.sensor.learn_mean_threshold", lambda: learns and assumed is not None and self.use_frames)
+        index = index_events(recording) if learns and assumed is not None else None
+        errors = errors_of_learning(index) if index is not None else {}
+        tells = errors.get("threshold_ratio", math.inf) <= LEARNED_WITHIN["threshold_ratio"]
+        ratio = self.use("model.sensor.learn_threshold_ratio", lambda: tells and bool(blind))
+        # where pixels are never blind, counts tell it better: on slider_depth what was learned drifted by a fifth
+        mean = self.use("model.sensor.learn_mean_threshold", lambda: tells and self.use_frames)
         why = self.why(name, "the recording states them" if assumed is None else assumed[0].why)
+        if index is not None and not tells:
+            why += f"; {len(index):,} events are too few to learn more"
         learned = " and ".join(["their ratio"] * ratio + ["their mean"] * mean)
         value = f"on {on:.3f}, off {off:.3f}" if on != off else f"{on:.3f} for both"
         value += f"; {learned} {'are' if ratio and mean else 'is'} learned" if learned else ""
         self.row("threshold per polarity", self.use_events and (on != off or ratio), value, why, name)
 
         name = "model.sensor.learn_threshold_map"
-        index = index_events(recording) if self.use_events else None
-        spread = threshold_spread(index, (on, off)) if learns and assumed is not None and index is not None else None
+        spread = threshold_spread(index, (on, off)) if index is not None else None
         kept = self.use(name, lambda: spread is not None)
         why = spread.why if spread else "events do not show that the thresholds of pixels differ"
         value = "thresholds of each pixel are learned" if kept else ""
         self.row("threshold map", kept, value, self.why(name, why), name)
 
-        for part, setting, what in (
-            ("leak", "leak_rate", "what the memory of pixels loses by itself"),
-            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness"),
+        for part, setting, what, told, unit in (
+            ("leak", "leak_rate", "what the memory of pixels loses by itself", "leak_rate", "on events a second"),
+            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness", "delay", "ms"),
         ):
             name = f"model.sensor.learn_{setting}"
             given = attrgetter(f"model.sensor.{setting}")(self.config)
-            kept = self.use(name, lambda given=given: learns and assumed is not None and not given)
-            why = "the sensor is unknown, and it is one number" if kept else "the sensor is known"
-            why = "set by flag" if given else self.why(name, why if learns else "the method does without")
+            error = errors.get(told, math.inf)
+            tells = error <= LEARNED_WITHIN[told]
+            kept = self.use(name, lambda learns=tells and not given: learns)
+            why = "the sensor is known" if learns else "the method does without"
+            if index is not None:
+                short = "" if tells else ", too few to learn it"
+                why = f"the sensor is unknown, and {len(index):,} events tell it within {error:.2g} {unit}{short}"
+            why = "set by flag" if given else self.why(name, why)
             value = f"{what} is {'learned' if kept else f'{given:g}'}" if kept or given else ""
             self.row(part, self.use_events and bool(kept or given), value, why, name)
 

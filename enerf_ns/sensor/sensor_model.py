@@ -149,6 +149,9 @@ class SensorModel(nn.Module):
     def measured_change(self, batch: EventBatch) -> Float[Tensor, " pairs"]:
         """Change of log brightness that pixels reported: C_on * (on events) - C_off * (off events), with the thresholds
         of each pixel, less what leaked; of silent pixels, what leaked alone.
+
+        Shot noise fires as many on as off events, which cancel where thresholds are equal; what is left of it elsewhere,
+        its rate times C_on - C_off, is a leak.
         """
         c_on, c_off = self.contrast_thresholds
         on, off = c_on * batch.on, c_off * batch.off
@@ -186,7 +189,8 @@ class SensorModel(nn.Module):
         """By how much log brightness changed more between two instants than what the pixels compare.
 
         A photoreceptor of first order follows log brightness x as y' = w (x - y), so that x - y = y' / w. Of y, events
-        tell the slope: the rates around the instants. The cut-off w grows with brightness as in v2e (Hu, Liu, Delbruck,
+        tell the slope: the rates around the instants. Of a chain of stages the delays 1 / w add up, as far as y' stays
+        the same meanwhile: so one stands for all. The cut-off w grows with brightness as in v2e (Hu, Liu, Delbruck,
         CVPRW 2021): (255 b + 20) / 275 of that at brightness 1.
 
         Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from itertools import pairwise
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from waves import HEIGHT, WIDTH, events_of_waves, recording_of
 
+from enerf_ns.choices import resolve
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
@@ -18,11 +20,14 @@ from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.sensor_estimates import (
     ASSUMED_THRESHOLD,
     contrast_thresholds,
+    errors_of_learning,
     noise_per_event,
     refractory_period,
     share_closer,
     threshold_spread,
 )
+from enerf_ns.enerf_config import enerf
+from enerf_ns.enerf_pipeline import EnerfPipelineConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings
@@ -79,6 +84,45 @@ def test_a_short_recording_tells_nothing():
     assert noise_per_event(one, (0.25, 0.25)).error == math.inf and share_closer(one, 10**9) == 0
     equal = index_of(np.full((500, 100), 10**9), np.random.default_rng(0).random((500, 100)) < 0.5)
     assert refractory_period(equal) is None
+
+
+def test_the_errors_of_learning_are_those_of_estimates_from_many_recordings():
+    """Of events at random times: their rate, the balance of their polarities, and when a step at all pixels was."""
+    generator = np.random.default_rng(5)
+    pixels, seconds, rate = 40, 2.0, 30.0
+    rates, ratios, told = [], [], []
+    for _ in range(200):
+        counts = generator.poisson(rate * seconds, pixels)
+        times = np.sort(generator.uniform(0.0, seconds * 1e9, counts.sum())).astype(np.int64)
+        pixel = generator.permutation(np.repeat(np.arange(pixels), counts))
+        is_on = generator.random(len(times)) < 0.5
+        events = Events(pixel, np.zeros_like(pixel), times, np.where(is_on, 1, -1))
+        told.append(errors_of_learning(EventIndex.from_events(events, pixels, 1)))
+        rates.append(len(times) / (pixels * seconds))
+        ratios.append(np.log(is_on.sum() / (~is_on).sum()))
+    mean = {name: np.mean([errors[name] for errors in told]) for name in told[0]}
+    assert mean["leak_rate"] == pytest.approx(np.std(rates), rel=0.15)
+    assert mean["threshold_ratio"] == pytest.approx(np.std(ratios), rel=0.15)
+    median = 1e3 * np.log(2.0) / rate  # ms, of an exponential distribution
+    assert mean["delay"] == pytest.approx(median / np.sqrt(rate * seconds * pixels), rel=0.1)
+
+
+@pytest.mark.parametrize(("duration", "is_long"), [(0.03, False), (3.0, True)])
+def test_a_recording_too_short_to_tell_a_parameter_keeps_what_it_starts_from(
+    tmp_path: Path, duration: float, is_long: bool
+):
+    recording = recording_of(events_of_waves((0.25, 0.25), duration), tmp_path)
+    config = copy.deepcopy(enerf.config.pipeline)
+    assert isinstance(config, EnerfPipelineConfig)
+    config.datamanager.dataparser.depth_range = (1.0, 4.0)
+    config.model.sensor.refractory_period_ns = 1_000_000  # where pixels are never blind, counts tell the ratio
+    found = resolve(config, recording)
+    rows = {row.part: row for row in found.choices}
+    assert rows["leak"].kept == found.values["model.sensor.learn_leak_rate"] == is_long
+    assert f"{len(index_events(recording)):,} events tell it within" in rows["leak"].why
+    assert found.values["model.sensor.learn_threshold_ratio"] == is_long
+    for part in ("leak", "threshold per polarity"):
+        assert ("too few" in rows[part].why) != is_long
 
 
 def test_close_intervals_are_counted_as_in_a_loop():
