@@ -85,8 +85,8 @@ RANGE_OF_NOISE = 2.9
 """Range of the sums of a random walk that one in a hundred exceeds, in standard deviations at its end."""
 
 LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "delay": 1.0}
-"""Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that a
-recording is too short to tell keeps what it starts from."""
+"""Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that
+a recording is too short to tell keeps what it starts from."""
 
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""

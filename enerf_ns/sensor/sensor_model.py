@@ -150,8 +150,8 @@ class SensorModel(nn.Module):
         """Change of log brightness that pixels reported: C_on * (on events) - C_off * (off events), with the thresholds
         of each pixel, less what leaked; of silent pixels, what leaked alone.
 
-        Shot noise fires as many on as off events, which cancel where thresholds are equal; what is left of it elsewhere,
-        its rate times C_on - C_off, is a leak.
+        Shot noise fires as many on as off events, which cancel where thresholds are equal; what is left of it
+        elsewhere, its rate times C_on - C_off, is a leak.
         """
         c_on, c_off = self.contrast_thresholds
         on, off = c_on * batch.on, c_off * batch.off
