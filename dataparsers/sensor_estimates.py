@@ -212,7 +212,7 @@ def errors_of_learning(index: EventIndex) -> dict[str, float]:
         index: On the CPU.
 
     Returns:
-        Of the threshold ratio, relative; of the leak rate, on events a second; of the delay, ms.
+        Of the threshold ratio, relative; of the leak rate, on events a second; of the cut-off frequency, ms of delay.
     """
     root = math.sqrt(len(index))
     watched = 1e-9 * int((index.offsets.diff() > 0).sum()) * int(index.times.max() - index.times.min())
@@ -221,7 +221,7 @@ def errors_of_learning(index: EventIndex) -> dict[str, float]:
     return {
         "threshold_ratio": 2.0 / root,
         "leak_rate": root / watched if watched else math.inf,
-        "delay": interval / root,
+        "cutoff_frequency": interval / root,
     }
 
 

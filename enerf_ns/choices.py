@@ -84,7 +84,7 @@ MOST_NOISE = 0.1
 RANGE_OF_NOISE = 2.9
 """Range of the sums of a random walk that one in a hundred exceeds, in standard deviations at its end."""
 
-LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "delay": 1.0}
+LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "cutoff_frequency": 1.0}
 """Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that
 a recording is too short to tell keeps what it starts from."""
 
@@ -445,19 +445,22 @@ class _Resolver:
         value = "thresholds of each pixel are learned" if kept else ""
         self.row("threshold map", kept, value, self.why(name, why), name)
 
-        for part, setting, what, told, unit in (
-            ("leak", "leak_rate", "what the memory of pixels loses by itself", "leak_rate", "on events a second"),
-            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness", "delay", "ms"),
+        lag_hides = blind and "pixels that are blind after events miss what would tell how far they lag"
+        for part, setting, what, unit, hidden in (
+            ("leak", "leak_rate", "what the memory of pixels loses by itself", "on events a second", ""),
+            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness", "ms", lag_hides or ""),
         ):
             name = f"model.sensor.learn_{setting}"
             given = attrgetter(f"model.sensor.{setting}")(self.config)
-            error = errors.get(told, math.inf)
-            tells = error <= LEARNED_WITHIN[told]
-            kept = self.use(name, lambda learns=tells and not given: learns)
+            error = errors.get(setting, math.inf)
+            tells = error <= LEARNED_WITHIN[setting]
+            kept = self.use(name, lambda learns=tells and not given and not hidden: learns)
             why = "the sensor is known" if learns else "the method does without"
             if index is not None:
-                short = "" if tells else ", too few to learn it"
-                why = f"the sensor is unknown, and {len(index):,} events tell it within {error:.2g} {unit}{short}"
+                few = "" if tells else ", too few to learn it"
+                why = (
+                    hidden or f"the sensor is unknown, and {len(index):,} events tell it within {error:.2g} {unit}{few}"
+                )
             why = "set by flag" if given else self.why(name, why)
             value = f"{what} is {'learned' if kept else f'{given:g}'}" if kept or given else ""
             self.row(part, self.use_events and bool(kept or given), value, why, name)

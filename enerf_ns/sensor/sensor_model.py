@@ -54,12 +54,14 @@ class SensorModelConfig:
     leak_rate: float = 0.0
     """On events a second of a pixel that sees nothing change."""
     learn_leak_rate: Optional[bool] = None  # noqa: UP045
-    """Learn the leak rate, starting from it. None: where the recording does not state the thresholds."""
+    """Learn the leak rate, starting from it. None: where the recording does not state the thresholds, and is long
+    enough to tell it."""
     cutoff_frequency: Optional[float] = None  # noqa: UP045
     """Cut-off frequency (Hz) of the photoreceptor at brightness 1; at brightness b it is (255 b + 20) / 275 of that.
     None: unlimited."""
     learn_cutoff_frequency: Optional[bool] = None  # noqa: UP045
-    """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds."""
+    """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds, and
+    pixels are not blind after events, which misleads it."""
     width: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
     """Width of the sensor, pixels."""
     height: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045

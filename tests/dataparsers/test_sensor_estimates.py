@@ -104,7 +104,7 @@ def test_the_errors_of_learning_are_those_of_estimates_from_many_recordings():
     assert mean["leak_rate"] == pytest.approx(np.std(rates), rel=0.15)
     assert mean["threshold_ratio"] == pytest.approx(np.std(ratios), rel=0.15)
     median = 1e3 * np.log(2.0) / rate  # ms, of an exponential distribution
-    assert mean["delay"] == pytest.approx(median / np.sqrt(rate * seconds * pixels), rel=0.1)
+    assert mean["cutoff_frequency"] == pytest.approx(median / np.sqrt(rate * seconds * pixels), rel=0.1)
 
 
 @pytest.mark.parametrize(("duration", "is_long"), [(0.03, False), (3.0, True)])
@@ -123,6 +123,7 @@ def test_a_recording_too_short_to_tell_a_parameter_keeps_what_it_starts_from(
     assert found.values["model.sensor.learn_threshold_ratio"] == is_long
     for part in ("leak", "threshold per polarity"):
         assert ("too few" in rows[part].why) != is_long
+    assert not rows["bandwidth"].kept and "blind" in rows["bandwidth"].why
 
 
 def test_close_intervals_are_counted_as_in_a_loop():
