@@ -388,11 +388,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=("The paper compares 60 with 6 views of mocap-desk2 by pictures; --data FOLDER names that recording.",),
     ),
     "slider-depth": Experiment(
-        "UZH's slider_depth (--data) beside Event-3DGS.",
-        ("e2vid", "filter", "events"),
+        "UZH's slider_depth (--data) beside Event-3DGS, and what events add to its frames.",
+        ("nerf-blurred", "e2vid", "filter", "events", "events+blurred"),
         recorded=("slider_depth",),
         protocols=("raw", "log-affine-set"),
-        columns=("psnr", "ssim", "lpips_vgg"),
+        columns=("psnr", "ssim", "correlation", "lpips_vgg"),
         published=published.SLIDER_DEPTH,
         source="Event-3DGS",
         notes=(
