@@ -35,6 +35,21 @@ def of_file(path: Path | str) -> Iterator[None]:
         raise RecordingError(f"{path} holds {str(error).rstrip('.')}.") from error
 
 
+def check_is_file(path: Path, expected: str) -> None:
+    """Says so where something is there that is no file: whoever opens a pipe or a device may wait for ever.
+
+    Args:
+        path: Links are followed.
+        expected: What is expected there, such as "an HDF5 file with events".
+
+    Raises:
+        RecordingError: A folder, pipe, device or socket.
+    """
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "no regular file (but a pipe, a device or a socket)"
+        raise RecordingError(f"{path} is {what}; {expected} was expected there.")
+
+
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
     """Turns whatever a library raises at a damaged file into one sentence about it.
@@ -44,9 +59,10 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         expected: What it is to hold, such as "an HDF5 file with events".
 
     Raises:
-        RecordingError: Anything went wrong.
+        RecordingError: Anything went wrong, or no file is there.
     """
     try:
+        check_is_file(path, expected)
         yield
     except UserError:
         raise

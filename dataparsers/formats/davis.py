@@ -19,7 +19,7 @@ import numpy as np
 from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, image_size, of_file
+from enerf_ns.dataparsers.files import check_image_size, check_is_file, image_size, of_file
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
@@ -83,6 +83,8 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
         notes.append(f"images.txt lists {len(files)} frames, but there is no folder {files[0].parent.name}/ of images.")
         return (), np.zeros(0, np.int64)
     for file, number in zip(files, numbers, strict=True):
+        if ".." in file.parts or not file.is_relative_to(folder):
+            raise RecordingError(f"{path}, line {number} lists {file}, which lies outside {folder}; copy it there.")
         if not file.is_file():
             raise RecordingError(f"{path}, line {number} lists {file}, which is missing; add it or drop the line.")
     found = set(files[0].parent.glob(f"*{files[0].suffix}"))
@@ -102,6 +104,7 @@ def _read_camera(path: Path, width: int, height: int) -> Camera:
 
 def _first_event_time(path: Path) -> int:
     try:
+        check_is_file(path, f"a file of events ({EVENT_COLUMNS})")
         with open(path, "rb") as file:
             line = file.readline()
     except OSError as error:

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import check_is_file
 from enerf_ns.dataparsers.recording import Events
 
 BYTES_AT_A_TIME = 2**18
@@ -69,6 +70,7 @@ def open_event_file(path: Path) -> EventFile:
             package that reads it is not installed.
     """
     try:
+        check_is_file(path, "an event file")
         num_bytes = path.stat().st_size
         with open(path, "rb") as file:
             begin = file.read(LARGEST_HEADER)

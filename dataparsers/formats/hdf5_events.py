@@ -108,19 +108,21 @@ class Hdf5Events:
     def _columns(self, file: h5py.File) -> dict[str, h5py.Dataset]:
         import h5py
 
-        group = file["events"] if "events" in file else file
+        group = _member(self.path, file, "events")
+        group = file if group is None else group
         if not isinstance(group, h5py.Group):
             raise RecordingError(
                 f"{self.path} holds a dataset events, but a group of the datasets x, y, t, p was expected."
             )
-        missing = [name for name in COLUMNS if not isinstance(group.get(name), h5py.Dataset)]
+        columns = {name: _member(self.path, group, name) for name in COLUMNS}
+        missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
         if missing:
             where = "its group events/" if group.name == "/events" else "its root"
             raise RecordingError(
                 f"{self.path} lacks the dataset{'s' * (len(missing) > 1)} {', '.join(missing)} in {where}; events are "
                 "the datasets x, y, t, p in a group events/ or at the root."
             )
-        return {name: group[name] for name in COLUMNS}  # type: ignore[misc]
+        return columns  # type: ignore[return-value]
 
     def _check(self, columns: dict[str, h5py.Dataset]) -> None:
         for name, column in columns.items():
@@ -141,9 +143,10 @@ class Hdf5Events:
             raise RecordingError(f"{self.path} holds no events; give a recording with some.")
 
     def _read_offset(self, file: h5py.File) -> int:
-        if "t_offset" not in file:
+        member = _member(self.path, file, "t_offset")
+        if member is None:
             return 0
-        offset = np.asarray(file["t_offset"])
+        offset = np.asarray(member)
         if offset.dtype.kind not in "iu" or offset.size != 1:
             raise RecordingError(
                 f"{self.path} holds t_offset as {offset.dtype} of shape {offset.shape}, but one integer (µs) was "
@@ -180,7 +183,7 @@ def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray,
     import hdf5plugin  # noqa: F401  makes the filters known
 
     with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
-        dataset = file.get("rectify_map")
+        dataset = _member(path, file, "rectify_map")
         if not isinstance(dataset, h5py.Dataset):
             raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
         if dataset.dtype.kind != "f" or dataset.shape != (height, width, 2):
@@ -198,6 +201,27 @@ def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray,
             "those of a camera do; make it again."
         )
     return rectify_map
+
+
+def _member(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
+    """What has a name in a group; None where nothing has.
+
+    Raises:
+        RecordingError: It is kept elsewhere, by a link, as external storage or as a virtual dataset: what lies in
+            another file of the disk is not for the sender of this one to name.
+    """
+    import h5py
+
+    link = group.get(name, getlink=True)
+    if link is None:
+        return None
+    member = group[name] if isinstance(link, h5py.HardLink) else None
+    if member is None or (isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)):
+        raise RecordingError(
+            f"{path} refers for {name} to another place, such as another file, and that is not followed; repack the "
+            "file with the data in it."
+        )
+    return member
 
 
 def _check_filters(path: Path, dataset: h5py.Dataset) -> None:

@@ -218,10 +218,10 @@ def make_broken_links(path: Path) -> None:
     ("damage", "message"),
     [
         (make_missing, "is missing; an HDF5 file with events was expected there."),
-        (make_folder, "cannot be read as an HDF5 file with events ("),
+        (make_folder, "is a folder; an HDF5 file with events was expected there."),
         (make_dataset, "holds a dataset events, but a group"),
         (make_groups, "lacks the datasets x, y, t, p in its group events/"),
-        (make_broken_links, "lacks the datasets x, y, t, p in its root"),
+        (make_broken_links, "refers for x to another place"),
         (lambda path: path.write_bytes(b""), "is empty; an HDF5 file with events was expected."),
         (lambda path: path.write_bytes(b"x y t p\n1 2 3 1\n"), "file signature not found"),
     ],
