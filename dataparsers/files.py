@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from jaxtyping import Float, UInt8
 from PIL import Image
 
@@ -167,6 +170,25 @@ def fill_page(template: Path, **values: Any) -> str:
         lstrip_blocks=True,
     )
     return templates.get_template(template.name).render(**values)
+
+
+def partial_of(path: Path) -> Path:
+    """A path beside another, for what becomes that one once it is whole. What processes of this machine that are gone
+    have left of such in the same folder is removed.
+
+    Args:
+        path: Of a file or folder; the name of the partial has the same suffix.
+    """
+    mark = f".partial-{platform.node()}-"
+    with suppress(OSError):  # no folder yet, or none that may be looked into
+        for entry in os.scandir(path.parent):
+            number = entry.name.rpartition(mark)[2].partition(".")[0] if entry.name.startswith(".") else ""
+            if mark in entry.name and number.isdecimal() and not psutil.pid_exists(int(number)):
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
+    return path.with_name(f".{path.stem}{mark}{os.getpid()}{path.suffix}")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

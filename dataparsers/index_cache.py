@@ -10,8 +10,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
-import time
 import zlib
 from dataclasses import asdict
 from pathlib import Path
@@ -23,8 +21,9 @@ from platformdirs import user_cache_path
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
+from enerf_ns.dataparsers.files import partial_of
 
-LAYOUT = 2
+LAYOUT = 3
 """Version of what is stored in an entry, counted up when that changes."""
 
 CACHED_FROM = 2_000_000
@@ -32,11 +31,8 @@ CACHED_FROM = 2_000_000
 
 COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
 
-CHECKED_BLOCKS, BLOCK = 64, 2**16
-"""Blocks of each file, and bytes of each block, whose checksum is compared when an entry is used."""
-
-STALE_SECONDS = 86400
-"""Age in seconds from which what an interrupted process has left behind is removed."""
+BLOCK = 2**22
+"""Bytes that are read at once for a checksum."""
 
 
 def cache_folder() -> Path:
@@ -114,10 +110,8 @@ def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]
 
 def _store(name: str, survey: Survey, bands) -> None:
     cache_folder().mkdir(parents=True, exist_ok=True)
-    for left_behind in cache_folder().glob(".partial-*"):
-        if time.time() - left_behind.stat().st_mtime > STALE_SECONDS:
-            shutil.rmtree(left_behind, ignore_errors=True)
-    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=cache_folder()))
+    partial = partial_of(cache_folder() / name)
+    partial.mkdir()
     try:
         with open(partial / "times", "wb") as times_file, open(partial / "positives", "wb") as positives_file:
             for times, positives in bands:
@@ -152,11 +146,9 @@ def _index(times: np.ndarray, positives: np.ndarray, survey: Survey) -> EventInd
 
 
 def _checksum(path: Path) -> list[int]:
-    """Size of a file, and a checksum of blocks spread evenly over it."""
-    size = path.stat().st_size
+    """Size of a file, and the checksum of all of it."""
     checksum = 0
     with open(path, "rb") as file:
-        for start in np.linspace(0, max(size - BLOCK, 0), CHECKED_BLOCKS).astype(np.int64).tolist():
-            file.seek(start)
-            checksum = zlib.crc32(file.read(BLOCK), checksum)
-    return [size, checksum]
+        while block := file.read(BLOCK):
+            checksum = zlib.crc32(block, checksum)
+    return [path.stat().st_size, checksum]

@@ -219,15 +219,16 @@ class EventRecording:
     """Whether pixels that fire far more often than their neighbourhood are used."""
     keep_pose_gaps: bool = False
     """Whether instants within the gaps of the trajectory are used."""
-    event_file_states: tuple[tuple[str, int, int], ...] = ()
-    """Path, size in bytes and time of modification (ns) of each of `event_files` when they were looked at; taken here
-    unless given."""
+    event_file_states: tuple[tuple[str, int, int, int], ...] = ()
+    """Path, size in bytes, and times of modification and of change (ns) of each of `event_files` when they were looked
+    at; taken here unless given."""
 
     def __post_init__(self) -> None:
         self._check_what_is_stated()
         if not self.event_file_states:
             states = [(file.resolve(), file.stat()) for file in self.event_files]
-            self._set(event_file_states=tuple((str(path), state.st_size, state.st_mtime_ns) for path, state in states))
+            told = ((str(path), now.st_size, now.st_mtime_ns, now.st_ctime_ns) for path, now in states)
+            self._set(event_file_states=tuple(told))
         notes, shares = [*self.notes], dict(self.shares_outside_poses)
         covered = {
             name: self._covered(getattr(self, name), what, notes, shares)

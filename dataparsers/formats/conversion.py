@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from enerf_ns.dataparsers.errors import OutputError, RecordingError
-from enerf_ns.dataparsers.files import read_json, write_whole
+from enerf_ns.dataparsers.files import partial_of, read_json, write_whole
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.registry import read_recording
@@ -142,7 +141,7 @@ def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
         )
     if output_dir == source or source in output_dir.parents:
         raise OutputError(f"--output-dir {output_dir} lies in the recording, which is only read; give another one.")
-    partial = output_dir.with_name(f".{output_dir.name}.partial-{os.getpid()}")
+    partial = partial_of(output_dir)
     try:
         partial.mkdir(parents=True)
         yield partial

@@ -29,7 +29,7 @@ from enerf_ns.bench.measures import TRUTH, evaluate
 from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.bench.tables import csv_table, markdown
 from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import read_json, write_whole
+from enerf_ns.dataparsers.files import partial_of, read_json, write_whole
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.evaluation.lpips import NETWORKS, Net
 from enerf_ns.evaluation.runs import method_config, set_up, train
@@ -443,7 +443,6 @@ def _made_whole(folder: Path) -> Iterator[Path | None]:
     if folder.exists():
         yield None
         return
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    partial = partial_of(folder)
     yield partial
     partial.rename(folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from torch import Tensor
 
 from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.event_index import OFF_COLOUR, ON_COLOUR, event_picture
-from enerf_ns.dataparsers.files import write_whole
+from enerf_ns.dataparsers.files import partial_of, write_whole
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Correction
@@ -218,7 +217,7 @@ def _strip(width: int, explained: dict[str, Any]) -> UInt8[np.ndarray, "height w
 @contextmanager
 def _partial(output: Path) -> Iterator[Path]:
     """A file beside another, in place of which it comes where the block ends well; it is gone otherwise."""
-    partial = output.with_name(f".{output.stem}.partial-{os.getpid()}{output.suffix}")
+    partial = partial_of(output)
     try:
         yield partial
         partial.replace(output)

@@ -299,8 +299,9 @@ def test_a_killed_conversion_leaves_no_recording_and_can_be_done_again(tmp_path:
         assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert not (tmp_path / "new").exists()
+    assert not (tmp_path / "new").exists() and list(tmp_path.glob(".new.partial-*"))
     Convert(source, tmp_path / "new").main()
+    assert {path.name for path in tmp_path.iterdir()} == {"new", source.name}, "what was left behind is gone"
     for name, column in columns.items():
         np.testing.assert_array_equal(np.load(tmp_path / f"new/events/{name}.npy"), column)
     shutil.rmtree(tmp_path / "new")
