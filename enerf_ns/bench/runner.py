@@ -444,5 +444,8 @@ def _made_whole(folder: Path) -> Iterator[Path | None]:
         yield None
         return
     partial = partial_of(folder)
-    yield partial
-    partial.rename(folder)
+    try:
+        yield partial
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
