@@ -208,6 +208,7 @@ class SensorModel(nn.Module):
             lags.append((1e-3 * self.delay * slope / share).clamp(-LARGEST_LAG, LARGEST_LAG))
         return lags[1] - lags[0]
 
+    @torch.no_grad()
     def observe(self, change: Float[Tensor, " pairs"], batch: EventBatch) -> None:
         """Learns what is not learned by gradients from what a training step rendered of a batch.
 
@@ -220,10 +221,9 @@ class SensorModel(nn.Module):
         fired, mean = batch.fired, self.mean_threshold
         on, off = batch.on[fired], batch.off[fired]
         c_on, c_off = (threshold / mean for threshold in self.contrast_thresholds)
-        with torch.no_grad():
-            factors = self.threshold_map.factors(batch.pixels[fired]) - 1.0
-            by_map = c_on * on * factors[:, 0] - c_off * off * factors[:, 1]
-            residual = (change[fired] - self.measured_change(batch)[fired]) / mean + by_map
+        factors = self.threshold_map.factors(batch.pixels[fired]) - 1.0
+        by_map = c_on * on * factors[:, 0] - c_off * off * factors[:, 1]
+        residual = (change[fired] - self.measured_change(batch)[fired]) / mean + by_map
         self.threshold_map.observe(batch.pixels[fired], on, off, residual, (c_on, c_off))
 
     def learned(self) -> dict[str, float]:
@@ -262,8 +262,13 @@ class SensorModel(nn.Module):
 
     @property
     def mean_threshold(self) -> float | Tensor:
-        """Mean contrast threshold: the unit in which losses count changes of log brightness."""
-        return 0.5 * sum(self._contrast_thresholds) if self.log_mean is None else self.log_mean.detach().exp()
+        """Mean contrast threshold: the unit in which losses count changes of log brightness.
+
+        Where it is learned, it is learned as that unit: rendered changes in thresholds are fitted to the events, not
+        events times the threshold to rendered changes. Noise of the events is then an error of what is fitted to, and
+        not of what is multiplied, which would draw the threshold to 0 (attenuation in a regression).
+        """
+        return 0.5 * sum(self._contrast_thresholds) if self.log_mean is None else self.log_mean.exp()
 
     def blind_after(
         self, event: Int64[Tensor, "*batch"], until: Int64[Tensor, "*batch"]

@@ -123,7 +123,25 @@ def test_also_behind_a_refractory_period_where_counts_mislead():
 
 def test_the_mean_of_the_thresholds_is_learned_where_brightness_is_known():
     sensor = learn(model(learn_mean_threshold=True), recorded(contrast_thresholds=(0.3, 0.3)).index, steps=900)
-    assert float(sensor.mean_threshold) == pytest.approx(0.3, rel=0.01)
+    assert float(sensor.contrast_thresholds[0]) == pytest.approx(0.3, rel=0.01)
+
+
+def with_noise(index: EventIndex, rate: float) -> EventIndex:
+    """With so many events more a second of each pixel, on or off, that know of nothing."""
+    generator, events = np.random.default_rng(3), index.events()
+    number = generator.poisson(rate * PIXELS * SECONDS)
+    pixel, times = generator.integers(0, PIXELS, number), generator.integers(0, int(SECONDS * 1e9), number)
+    noise = (pixel % WIDTH, pixel // WIDTH, times, generator.choice([-1, 1], number))
+    both = [np.concatenate(pair) for pair in zip((events.x, events.y, events.t, events.p), noise, strict=True)]
+    order = np.argsort(both[2], kind="stable")
+    return EventIndex.from_events(Events(*(column[order] for column in both)), WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("mode", ["successor", "partner"])
+def test_noise_does_not_draw_the_mean_of_the_thresholds_to_nothing(mode: str):
+    """A third as many events more: the mean would be learned as 0.144 and 0.188 from events times the threshold."""
+    sensor = learn(model(learn_mean_threshold=True), with_noise(recorded().index, 20.0), steps=900, mode=mode)
+    assert float(sensor.contrast_thresholds[0]) == pytest.approx(0.2, rel=0.05)
 
 
 def test_the_leak_rate_is_learned():
@@ -232,7 +250,7 @@ def test_gradients_are_those_of_finite_differences(name: str):
     index = recorded(cutoff_frequency=60.0, refractory_period=3_000_000, leak_rate=1.0).index
     batch = Drawn(index, 2, "partner").batch(sensor)
 
-    def loss() -> Tensor:  # not that in units of the mean threshold, which is held while it is learned
+    def loss() -> Tensor:
         change = brightness_change(*seen(sensor, batch), batch, sensor) - sensor.measured_change(batch)
         return change.square().mean()
 
