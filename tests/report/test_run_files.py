@@ -93,7 +93,7 @@ def test_a_run_whose_last_line_or_checkpoint_is_half_written_is_what_it_was_befo
 def test_a_history_that_cannot_be_read_is_one_sentence(copy_run: CopyRun):
     folder = copy_run("run")
     (folder / "history.jsonl").mkdir()
-    with pytest.raises(RecordingError, match=r"^\S+history\.jsonl is a folder; the history of a run was expected there"):
+    with pytest.raises(RecordingError, match=r"^\S+history\.jsonl is a folder; the history of a run was expected"):
         read_run(folder)
 
 
