@@ -33,7 +33,7 @@ from enerf_ns.dataparsers.sensor_estimates import (
 )
 from enerf_ns.enerf_datamanager import HELD_OUT_SPANS, EnerfDataManagerConfig
 from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
-from enerf_ns.enerf_model import MEAN_BRIGHTNESS, EnerfModelConfig
+from enerf_ns.enerf_model import FRAME_LOSS_WEIGHT, MEAN_BRIGHTNESS, EnerfModelConfig
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.paper_selections import preset_named, selections
 from enerf_ns.poses.motion import exposure_motion
@@ -472,7 +472,11 @@ class _Resolver:
         why = "the recording states it" if stated else "the response of E-NeRF"
         if recording.response and not self.use_frames:
             why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
-        self.row("response", self.use_events, response, self.why(name, why), name)
+        unknown = index is not None and self.config.model.sensor.response is None and not stated
+        learned = self.use("model.sensor.learn_response", lambda: unknown and tells and self.use_frames)
+        value = f"learned, starting from {response}" if learned else response
+        why += "; frames tell it better" if learned else ""
+        self.row("response", self.use_events, value, self.why(name, why), name)
 
         name = "model.level_loss_weight"
         alone = self.use_events and not self.use_frames
@@ -513,6 +517,8 @@ class _Resolver:
         defaults = self.config.defaults
         rays = defaults.rays_beside_events if self.use_events and self.use_frames else defaults.train_num_rays_per_batch
         self.use("datamanager.train_num_rays_per_batch", lambda: rays)
+        if not (self.use_events and self.use_frames and self.config.model.event_loss_weight):
+            self.use("model.frame_loss_weight", lambda: FRAME_LOSS_WEIGHT)
         if not self.use_frames:
             why = f"supervision is {data.supervision}" if recording.has_frames else "the recording holds no frames"
             self.row("frame loss", False, "", why, name)
@@ -521,6 +527,8 @@ class _Resolver:
         what = "blurred frames" if blurred else "sharp frames"
         if blurred and recording.reconstructed_by is not None:
             what = f"frames of events, by {recording.reconstructed_by}"
+        if self.use_events and self.config.model.frame_loss_weight is None:
+            what += ", whose weight the errors of events and frames make"
         self.row("frame loss", True, what, f"supervision is {data.supervision}", name)
         frames = recording.blurred_frames if blurred else recording.frames
         if frames is not None and self.use_events:

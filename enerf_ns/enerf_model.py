@@ -32,6 +32,7 @@ from enerf_ns.memory import in_parts
 from enerf_ns.ray_samplers import PairedPiecewiseSampler, PairedProposalSampler, PairedUniformSampler, paired_rand
 from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.sensor.sensor_model import SensorModelConfig
+from enerf_ns.supervision.balance import FrameBalance
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
 from enerf_ns.supervision.losses import frame_loss
 
@@ -48,6 +49,9 @@ FAR_SHARE = 0.75
 MEAN_BRIGHTNESS = 0.3
 """Geometric mean of brightness near which a field is held that learns from events alone: both what is three times as
 bright and what is a third as bright lie where the field and linlog are logarithmic."""
+
+FRAME_LOSS_WEIGHT = 10.0
+"""Weight of the frame loss beside the regularisers."""
 
 FAINTEST = 1e-4
 """Least brightness that counts in a mean of log brightness."""
@@ -104,8 +108,8 @@ class EnerfModelConfig(ModelConfig):
     no_event_margin: Optional[float] = None  # noqa: UP045
     """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation. None:
     0, or as the paper for enerf-paper."""
-    frame_loss_weight: float = 10.0
-    """Weight of the loss on frames."""
+    frame_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`FrameBalance`)."""
     level_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the squared difference between the mean log brightness of a batch and that of `MEAN_BRIGHTNESS`. None:
     0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
@@ -199,6 +203,7 @@ class EnerfModel(Model):
         assert config.level_loss_weight is not None
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
+        self.frame_balance = FrameBalance() if config.frame_loss_weight is None else None
         self.supervision = EventSupervision(
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
@@ -403,7 +408,12 @@ class EnerfModel(Model):
                 level = (seen.clamp(min=FAINTEST) / MEAN_BRIGHTNESS).log().mean()
                 losses["level_loss"] = config.level_loss_weight * level.square()
         if batch.frames is not None:
-            losses["frame_loss"] = config.frame_loss_weight * self._frame_loss(frames, batch.frames)
+            error = self._frame_loss(frames, batch.frames)
+            weight = config.frame_loss_weight
+            if self.frame_balance and batch.events is not None and "event_loss" in losses:
+                of_events = losses["event_loss"].detach() / config.event_loss_weight
+                weight = self.frame_balance(of_events, batch.num_pairs - batch.events.num_silent, error, len(frames))
+            losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
             if config.opacity_loss_weight:

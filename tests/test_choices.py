@@ -148,6 +148,50 @@ def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp
     assert f"{index.num_positive:,} on" in rows(resolution)["threshold per polarity"].why
 
 
+def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recording: Path):
+    """From many events: of 24 at every pixel nobody states what made them."""
+    number, pixels = 24, WIDTH * HEIGHT
+    places = np.tile(np.arange(pixels), number)
+    polarity = np.repeat(np.where(np.arange(number) % 4 < 2, 1, -1), pixels).astype(np.int8)
+    times = np.repeat(10_000_000 + 3_000_000 * np.arange(number), pixels)
+    events = Events(places % WIDTH, places // WIDTH, times, polarity)
+    unknown = replace(
+        read_recording(recording), contrast_thresholds=None, response=None, stream_events=lambda: iter([events])
+    )
+
+    def chosen(supervision: str, response: str | None, made: EventRecording) -> tuple[bool, str]:
+        config = copy.deepcopy(ENERF)
+        config.datamanager.supervision, config.model.sensor.response = supervision, response
+        resolution = resolve(config, made)
+        row = rows(resolution)["response"]
+        return resolution.values["model.sensor.learn_response"], f"{row.value}; {row.why}"
+
+    learned, said = chosen("events+frames", None, unknown)
+    assert learned and "learned, starting from linlog" in said and "frames tell it better" in said
+    for supervision, response, made in (
+        ("events", None, unknown),
+        ("events+frames", "logarithm:0.1", unknown),
+        ("events+frames", None, replace(unknown, response="logarithm:0.1")),
+        ("events+frames", None, replace(unknown, contrast_thresholds=(0.2, 0.2))),
+    ):
+        learned, said = chosen(supervision, response, made)
+        assert not learned and "learned" not in said
+
+
+def test_frames_beside_events_have_the_weight_that_their_errors_make(recording: Path):
+    for supervision, given, expected in (
+        ("events", None, 10.0),
+        ("frames", None, 10.0),
+        ("events+frames", None, None),
+        ("events+frames", 3.0, 3.0),
+    ):
+        config = copy.deepcopy(ENERF)
+        config.datamanager.supervision, config.model.frame_loss_weight = supervision, given
+        resolution = resolve(config, read_recording(recording))
+        assert resolution.applied_to(config).model.frame_loss_weight == expected
+        assert ("errors of events and frames" in rows(resolution)["frame loss"].value) == (expected is None)
+
+
 def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_path: Path):
     """The response where frames fix brightness: events alone are learnt from better with E-NeRF's."""
     stated = replace(
@@ -205,7 +249,7 @@ def test_windows_are_as_long_as_is_said(recording: Path, mode: str, window_ms: f
 )
 def test_a_flag_stands_and_is_said_to(recording: Path, tmp_path: Path, setting: str, value: Any, part: str):
     resolution = resolution_of(recording, tmp_path, **{setting: value})
-    assert not any(name.endswith(setting.rpartition("__")[2]) for name in resolution.values)
+    assert not any(name.endswith("." + setting.rpartition("__")[2]) for name in resolution.values)
     assert rows(resolution)[part].why == "set by flag"
 
 

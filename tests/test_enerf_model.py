@@ -16,6 +16,7 @@ from enerf_ns.enerf_model import MEAN_BRIGHTNESS
 from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
+from enerf_ns.supervision.balance import FrameBalance
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +26,7 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
         tmp_path_factory.mktemp("outputs"),
         data__supervision="events+frames",
         data__silent_pairs=16,
+        model__frame_loss_weight=3.0,
         model__opacity_loss_weight=0.5,
         model__level_loss_weight=0.2,
     )
@@ -132,6 +134,19 @@ def test_all_is_finite_for_any_ray_and_density(pipeline: Any, training: bool, lo
             bias.copy_(value)
     pipeline.zero_grad()
     pipeline.train()
+
+
+def test_frames_beside_events_are_weighed_by_the_errors_of_both(pipeline: Any):
+    batch, rays = rays_of(pipeline)
+    model = pipeline.model
+    outputs = model(rays)
+    before = model.get_loss_dict(outputs, batch)
+    model.frame_balance = FrameBalance()
+    after = model.get_loss_dict(outputs, batch)
+    model.frame_balance = None
+    pairs, pixels = len(batch.events) - batch.events.num_silent, len(batch.frames.indices)
+    torch.testing.assert_close(after["frame_loss"], before["event_loss"] / pairs * pixels)
+    assert all(torch.equal(after[name], before[name]) for name in before if name != "frame_loss")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

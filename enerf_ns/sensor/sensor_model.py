@@ -33,8 +33,9 @@ class SensorModelConfig:
     response: Optional[str] = None  # noqa: UP045
     """What a pixel makes of brightness: linlog, or logarithm:OFFSET; or gamma:EXPONENT:OFFSET, whose field renders
     gamma-encoded brightness. None: the recording's own, else linlog."""
-    learn_response: bool = False
-    """Learn how pixels answer brightness, starting from the response; for events with frames."""
+    learn_response: Optional[bool] = None  # noqa: UP045
+    """Learn how pixels answer brightness, starting from the response. None: where the field learns from frames, too,
+    and the recording states neither thresholds nor response."""
     refractory_period_ns: Optional[int] = None  # noqa: UP045
     """For how long (ns) a pixel is blind after an event. None: the recording's own, else what the shortest intervals
     between events tell."""
