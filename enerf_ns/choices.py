@@ -55,6 +55,8 @@ class MethodDefaults:
     """Silent pairs where the field learns from frames, too, which tell of plain surfaces as well."""
     rays_beside_events: int = 426
     """Rays of frames where the field learns from events, too: those that silent pairs have less."""
+    noisy_pairs_beside_frames: int = 725
+    """Pairs of noisy events where the field learns from frames, too, which then have as many rays as by themselves."""
     event_loss: str = "huber"
     no_event_loss_weight: float = 0.1
     no_event_margin: float = 0.0
@@ -213,6 +215,7 @@ class _Resolver:
         self.selection: list[str] = []
         self.preset_values: dict[str, Any] = {}
         self._blind_why = ""
+        self._frames_tell_more = False
         if preset is not None:
             name, whole = preset_named(preset), config.defaults.whole_preset
             self.preset_values, self.selection = selections(name, recording, self.parser, whole)
@@ -334,7 +337,6 @@ class _Resolver:
         value = f"{100 * share:.3g} % of the time, in {HELD_OUT_SPANS} spans" if share else ""
         why = "what is learnt is checked by them" if share else "the correlation of events is that of training pairs"
         self.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
-        pairs = self.use("datamanager.event_pairs", lambda: defaults.event_pairs)
         blind = self.use("model.sensor.refractory_period_ns", self._refractory_period)
         mode = self.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
         longest = LONGEST_ACCUMULATION * 1e-6 * (recording.span[1] - recording.span[0])
@@ -343,6 +345,11 @@ class _Resolver:
             found = self._noise.value
             distance = max(2, min(LONGEST_DISTANCE, round(MOST_NOISE / max(found, 1e-9))))
             noise = f"; their noise adds {found:.2g} squared thresholds an event"
+            self._frames_tell_more = self.use_frames and distance < LONGEST_DISTANCE
+        more = self._frames_tell_more
+        pairs = self.use(
+            "datamanager.event_pairs", lambda: defaults.noisy_pairs_beside_frames if more else defaults.event_pairs
+        )
         distance = self.use("datamanager.max_pair_distance", lambda: distance)
         window = self.use("datamanager.window_ms", lambda: longest if mode == "accumulated" else DEFAULT_WINDOW_MS)
         if not self.use_events:
@@ -515,7 +522,8 @@ class _Resolver:
         """Whether frames are learnt from, and whether a second camera took them."""
         data, recording, name = self.config.datamanager, self.recording, "datamanager.supervision"
         defaults = self.config.defaults
-        rays = defaults.rays_beside_events if self.use_events and self.use_frames else defaults.train_num_rays_per_batch
+        beside = self.use_events and self.use_frames and not self._frames_tell_more
+        rays = defaults.rays_beside_events if beside else defaults.train_num_rays_per_batch
         self.use("datamanager.train_num_rays_per_batch", lambda: rays)
         if not (self.use_events and self.use_frames and self.config.model.event_loss_weight):
             self.use("model.frame_loss_weight", lambda: FRAME_LOSS_WEIGHT)
@@ -529,7 +537,10 @@ class _Resolver:
             what = f"frames of events, by {recording.reconstructed_by}"
         if self.use_events and self.config.model.frame_loss_weight is None:
             what += ", whose weight the errors of events and frames make"
-        self.row("frame loss", True, what, f"supervision is {data.supervision}", name)
+        why = f"supervision is {data.supervision}"
+        if self._frames_tell_more:
+            why += "; they have the rays of more pairs, since events are noisy"
+        self.row("frame loss", True, what, why, name)
         frames = recording.blurred_frames if blurred else recording.frames
         if frames is not None and self.use_events:
             second = frames.trajectory is not recording.trajectory or frames.camera != recording.camera

@@ -66,7 +66,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     supervision: Literal["events", "events+frames", "frames"] = "events"
     """What the field learns from."""
     event_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of instants with events between them, drawn at each step. None: 1024, or as the paper for enerf-paper."""
+    """Pairs of instants with events between them, drawn at each step. None: 1024, of noisy events beside frames 725, or
+    as the paper for enerf-paper."""
     pair_mode: Optional[Literal["successor", "partner", "window", "accumulated"]] = None  # noqa: UP045
     """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. Or no two events,
     but a window of any length whose events are summed, as in EventNeRF (accumulated). None: one of the next few, but
@@ -91,8 +92,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Share of the recording's time, in 8 equal spans spread evenly over it, at which no pair starts or ends: the
     correlation of events is measured there. 0: none, and it is measured over training pairs."""
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
-    """Rays of frames at each step, where the field learns from frames. None: 1024, beside events 426, or as the paper
-    for enerf-paper."""
+    """Rays of frames at each step, where the field learns from frames. None: 1024, beside events that are not noisy
+    426, or as the paper for enerf-paper."""
     exposure_samples: Optional[int] = None  # noqa: UP045
     """Instants of its exposure over which a pixel of a frame is averaged, of which each takes a ray; 1: it is taken as
     seen in the middle. None: as many as the motion needs, where the exposures are known."""

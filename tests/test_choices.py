@@ -148,16 +148,40 @@ def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp
     assert f"{index.num_positive:,} on" in rows(resolution)["threshold per polarity"].why
 
 
-def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recording: Path):
-    """From many events: of 24 at every pixel nobody states what made them."""
-    number, pixels = 24, WIDTH * HEIGHT
-    places = np.tile(np.arange(pixels), number)
-    polarity = np.repeat(np.where(np.arange(number) % 4 < 2, 1, -1), pixels).astype(np.int8)
-    times = np.repeat(10_000_000 + 3_000_000 * np.arange(number), pixels)
-    events = Events(places % WIDTH, places // WIDTH, times, polarity)
-    unknown = replace(
+def of_unknown_sensor(recording: Path, polarity: np.ndarray) -> EventRecording:
+    """Events of all pixels at once, at times drawn from 80 ms, of a polarity of the shape (events, pixels); frames as
+    recorded."""
+    number, pixels = polarity.shape
+    instants = np.sort(np.random.default_rng(1).integers(10_000_000, 90_000_000, number))
+    places, times = np.tile(np.arange(pixels), number), np.repeat(instants, pixels)
+    events = Events(places % WIDTH, places // WIDTH, times, polarity.reshape(-1).astype(np.int8))
+    return replace(
         read_recording(recording), contrast_thresholds=None, response=None, stream_events=lambda: iter([events])
     )
+
+
+def test_of_noisy_events_frames_have_more_rays_at_no_cost(recording: Path):
+    """Events that alternate cancel; of events with a polarity drawn by chance, each adds its square."""
+    drawn = {}
+    for name, polarity in {
+        "regular": np.broadcast_to(np.where(np.arange(96) % 2, 1, -1)[:, None], (96, WIDTH * HEIGHT)),
+        "noisy": np.random.default_rng(0).choice([-1, 1], (96, WIDTH * HEIGHT)),
+    }.items():
+        config = copy.deepcopy(ENERF)
+        config.datamanager.supervision, config.datamanager.silent_pairs = "events+frames", 128
+        config.model.sensor.refractory_period_ns = 0
+        resolution = resolve(config, of_unknown_sensor(recording, polarity))
+        values = resolution.values
+        assert ("noisy" in rows(resolution)["frame loss"].why) == (name == "noisy")
+        drawn[name] = values["datamanager.event_pairs"], values["datamanager.train_num_rays_per_batch"]
+    assert drawn["noisy"][0] < drawn["regular"][0] and drawn["noisy"][1] > drawn["regular"][1]
+    cost = {name: 2 * pairs + rays for name, (pairs, rays) in drawn.items()}
+    assert cost["noisy"] == cost["regular"]
+
+
+def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recording: Path):
+    regular = np.where(np.arange(96) % 4 < 2, 1, -1)[:, None]
+    unknown = of_unknown_sensor(recording, np.broadcast_to(regular, (96, WIDTH * HEIGHT)))
 
     def chosen(supervision: str, response: str | None, made: EventRecording) -> tuple[bool, str]:
         config = copy.deepcopy(ENERF)
