@@ -29,6 +29,9 @@ ROTATION_TOLERANCE = 1e-3
 LARGEST_SIDE = 2**16 - 1
 """Most pixels along a side of a camera; larger columns and rows do not fit the types that events are stored in."""
 
+MOST_PIXELS = 2**26
+"""Most pixels of a camera: more than ten times those of any event camera, and what a gigabyte holds the counts of."""
+
 COEFFICIENTS = {
     "pinhole": ((0,), "no coefficients"),
     "radtan": ((4, 5), "finite numbers k1 k2 p1 p2 and perhaps k3"),
@@ -81,6 +84,10 @@ class Camera:
             raise ValueError(
                 f"a camera of {self.width:g} x {self.height:g} pixels, but whole numbers from 1 to {LARGEST_SIDE} were "
                 "expected."
+            )
+        if self.width * self.height > MOST_PIXELS:
+            raise ValueError(
+                f"a camera of {self.width:g} x {self.height:g} pixels, but at most {MOST_PIXELS:,} were expected."
             )
         for name in ("width", "height"):
             object.__setattr__(self, name, int(getattr(self, name)))

@@ -17,7 +17,36 @@ import psutil
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from enerf_ns.dataparsers.errors import RecordingError, UserError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError, UserError
+
+
+def expanded(path: Path | str) -> Path:
+    """A path that a user gave, with the home folder that ~ stands for.
+
+    Raises:
+        FlagError: That folder is unknown, or the path is not UTF-8, of which some libraries take no other.
+    """
+    try:
+        expanded = Path(path).expanduser()
+    except RuntimeError as error:
+        raise FlagError(f"{path} begins with a home folder that is not known; give the path without ~.") from error
+    try:
+        str(expanded).encode()
+    except UnicodeEncodeError as error:
+        raise FlagError(f"{expanded} holds bytes that are not UTF-8; rename it.") from error
+    return expanded
+
+
+def absolute(path: Path | str) -> Path:
+    """A path that a user gave, with ~ for a home folder, as an absolute one without links.
+
+    Raises:
+        FlagError: The home folder is unknown, the path is not UTF-8, or links lead in a circle.
+    """
+    try:
+        return expanded(expanded(path).resolve())
+    except (OSError, RuntimeError) as error:  # of which Python has raised either, depending on its version
+        raise FlagError(f"{path} cannot be followed (links that lead in a circle); give another path.") from error
 
 
 @contextmanager
@@ -70,15 +99,41 @@ def reading(path: Path, expected: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:  # of any kind, since libraries have their own for what is damaged
-        if not path.exists():
-            raise RecordingError(f"{path} is missing; {expected} was expected there.") from error
-        if path.is_file() and path.stat().st_size == 0:
-            raise RecordingError(f"{path} is empty; {expected} was expected.") from error
+        _check_can_be_read(path, expected)
         lines = str(error).strip("\"' \n").splitlines() or [type(error).__name__]
         reason = lines[0].rstrip(".").replace(". ", ", ")
         raise RecordingError(
             f"{path} cannot be read as {expected} ({reason}); copy it again from its source."
         ) from error
+
+
+def _check_can_be_read(path: Path, expected: str) -> None:
+    """Raises a RecordingError where nothing, or nothing but an empty file, or one that is not to be read, is there."""
+    try:
+        with open(path, "rb") as file:
+            is_empty = not file.read(1)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} is missing; {expected} was expected there.") from error
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be opened ({error.strerror}); {expected} was expected, which you may read."
+        ) from error
+    if is_empty:
+        raise RecordingError(f"{path} is empty; {expected} was expected.")
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The text of a file, UTF-8 with or without a byte-order mark.
+
+    Args:
+        path: The file.
+        expected: What it is to hold, such as "JSON".
+
+    Raises:
+        RecordingError: The file is missing, cannot be read, or is no text.
+    """
+    with reading(path, expected):
+        return path.read_text(encoding="utf-8-sig")
 
 
 def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
@@ -152,7 +207,7 @@ def read_json(path: Path) -> dict[str, Any]:
         RecordingError: The file is missing or holds no JSON object.
     """
     with reading(path, "JSON"):
-        value = json.loads(path.read_text(encoding="utf-8-sig"))
+        value = json.loads(read_text(path, "JSON"))
     if not isinstance(value, dict):
         raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
     return value

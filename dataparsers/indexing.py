@@ -21,6 +21,7 @@ from enerf_ns.dataparsers.recording import (
     EventRecording,
     Events,
     left_out,
+    percent,
     seconds,
 )
 
@@ -68,6 +69,13 @@ def index_events(recording: EventRecording) -> EventIndex:
         _check(recording, survey)
         if not recording.keep_hot_pixels:
             survey.leave_out_hot_pixels(camera.height)
+            if survey.counts.max() < 2:
+                hot = len(survey.hot_pixels)
+                raise RecordingError(
+                    f"{recording.path} holds {survey.num_events:,} events, of which {survey.num_hot_events:,} are of "
+                    f"{hot:,} hot pixel{'s' * (hot > 1)}, with over 10 times as many as around, and no other pixel has "
+                    "two; keep them with --keep-hot-pixels True if they are no fault, else give another recording."
+                )
         try:
             index = build_index(stream, survey, name, notes)
         except ValueError as error:
@@ -105,7 +113,7 @@ def _count_in_gaps(recording: EventRecording, index: EventIndex) -> int:
 def _gap_notes(recording: EventRecording, num_events: int, total: int) -> Iterator[str]:
     if num_events:
         yield (
-            f"{num_events:,} of {total:,} events ({100 * num_events / total:.2g} %) lie in "
+            f"{num_events:,} of {total:,} events ({percent(num_events / total)}) lie in "
             f"{describe_gaps(recording.pose_gaps)}, and start or end no pair; --keep-pose-gaps True keeps them."
         )
     for what, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():

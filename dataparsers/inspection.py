@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Float64, Int64, UInt8
 from PIL import Image
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.agreement import HARMFUL_SHIFT, MILLISECOND, SHOWN_DELAYS, Agreement, shown_hypotheses
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
-from enerf_ns.dataparsers.errors import UserError
+from enerf_ns.dataparsers.errors import UserError, printable
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.files import fill_page, load_image
 from enerf_ns.dataparsers.focus import AS_READ, AS_STATED, Hypothesis
@@ -35,7 +35,7 @@ from enerf_ns.dataparsers.problems import (
     pose_gaps,
     unusual_rates,
 )
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording import EventRecording, Frames, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.sensor_survey import SensorSurvey
 from enerf_ns.dataparsers.trajectory import evenly_spaced
@@ -133,10 +133,10 @@ class Inspection:
         for title, rows in self._tables():
             table = Table(title=title, show_header=False, title_justify="left")
             for name, value in rows.items():
-                table.add_row(name, escape(value))
+                table.add_row(name, Text(printable(value)))
             console.print(table)
         for note in self.notes():
-            console.print(f"[yellow]note: {escape(note)}[/yellow]", highlight=False)
+            console.print(Text(f"note: {printable(note)}", "yellow"))
         console.print(problems_table(self.problems))
 
     def notes(self) -> list[str]:
@@ -195,7 +195,7 @@ class Inspection:
             _, scale, box = scene_normalisation(recording, near, far)
             sides = " x ".join(f"{side:.3g}" for side in (box[1] - box[0]) / scale)
             rows["near and far"] = f"{near:.3g} m and {far:.3g} m, {source}"
-            rows["beyond"] = f"{100 * share_beyond(recording, self.depth_range):.2g} % of the events"
+            rows["beyond"] = f"{percent(share_beyond(recording, self.depth_range))} of the events"
             rows["box"] = f"{sides} m, all that the camera sees; 1 m is {scale:.3g} in Nerfstudio"
         else:
             rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
@@ -452,7 +452,7 @@ def problems_table(problems: list[Problem]) -> Table | str:
     table.add_column("what was found", style="red", ratio=1)
     table.add_column("what to do", ratio=1)
     for problem in problems:
-        table.add_row(escape(problem.what), escape(problem.advice))
+        table.add_row(Text(printable(problem.what)), Text(printable(problem.advice)))
     return table
 
 

@@ -17,7 +17,7 @@ from enerf_ns.dataparsers.depth_range import recording_parallax
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import read_json
 from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Frames, nanoseconds
+from enerf_ns.dataparsers.recording import EventRecording, Frames, nanoseconds, percent
 from enerf_ns.dataparsers.trajectory import evenly_spaced
 
 MAX_BINS = 1000
@@ -261,7 +261,7 @@ def _left_out(shares_outside_poses: dict[str, float]) -> Iterator[Problem]:
     for what, share in shares_outside_poses.items():
         if share > MAX_SHARE_OUTSIDE:
             yield Problem(
-                f"{100 * share:.2g} % of the {what} lie outside the poses and are left out.",
+                f"{percent(share)} of the {what} lie outside the poses and are left out.",
                 "Check that poses and events are on one clock, and add the poses that are missing; where the tracker "
                 "only saw a part, nothing else need be done.",
             )
@@ -375,7 +375,7 @@ def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
     hot = statistics.num_hot_pixels
     if hot > MAX_SHARE_HOT * statistics.counts.size:
         yield Problem(
-            f"The sensor has {_count(hot, 'hot pixel')} ({100 * hot / statistics.counts.size:.2g} %), left out here.",
+            f"The sensor has {_count(hot, 'hot pixel')} ({percent(hot / statistics.counts.size)}), left out here.",
             "If they lie on bright points of the scene, keep them with --keep-hot-pixels True; else raise the sensor's "
             "thresholds, let it cool, or mask them in its settings.",
         )

@@ -455,7 +455,15 @@ def overlaps(one: Int64[np.ndarray, "ones 2"], other: Int64[np.ndarray, "others 
 
 def left_out(dropped: int, total: int, what: str) -> str:
     """A note about frames or events that lie outside the poses."""
-    return f"{dropped:,} of {total:,} {what} ({100 * dropped / total:.2g} %) lie outside the poses and are left out."
+    return f"{dropped:,} of {total:,} {what} ({percent(dropped / total)}) lie outside the poses and are left out."
+
+
+def percent(share: float) -> str:
+    """A share in [0, 1] as it is shown, with two digits and never as a power of ten."""
+    value = 100 * share
+    if 0 < value < 0.01:
+        return "less than 0.01 %"
+    return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
 
 
 def nanoseconds(time: float) -> int:

@@ -21,7 +21,7 @@ from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
 from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.sensor_estimates import (
     Estimate,
@@ -325,9 +325,7 @@ class _Resolver:
             self.row("pose gaps", False, "", why, name)
             return
         index = index_events(recording)
-        why = (
-            f"{index.num_in_gaps:,} events ({100 * index.num_in_gaps / len(index):.2g} %) lie in {describe_gaps(gaps)}"
-        )
+        why = f"{index.num_in_gaps:,} events ({percent(index.num_in_gaps / len(index))}) lie in {describe_gaps(gaps)}"
         self.row("pose gaps", kept, "used" if kept else "left out", "set by flag; " * kept + why, name)
 
     def _events(self) -> None:

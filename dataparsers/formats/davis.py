@@ -10,6 +10,7 @@ Mueggler et al., "The event-camera dataset and simulator", International Journal
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from enerf_ns.compiled import compiled
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, check_is_file, image_size, of_file
+from enerf_ns.dataparsers.files import check_image_size, image_size, of_file, reading
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
@@ -103,12 +104,8 @@ def _read_camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _first_event_time(path: Path) -> int:
-    try:
-        check_is_file(path, f"a file of events ({EVENT_COLUMNS})")
-        with open(path, "rb") as file:
-            line = file.readline()
-    except OSError as error:
-        raise RecordingError(f"{path} is missing; a file of events ({EVENT_COLUMNS}) was expected.") from error
+    with reading(path, f"a file of events ({EVENT_COLUMNS})"), open(path, "rb") as file:
+        line = file.readline().removeprefix(BOM_UTF8)
     if not line.strip():
         raise RecordingError(f"{path} is empty; events ({EVENT_COLUMNS}) were expected.")
     columns = tuple(np.empty(1, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
@@ -123,7 +120,8 @@ def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
     end = len(text)
     while end and text[end - 1] in b" \t\r\n":
         end -= 1
-    parse, num_events, start = compiled(_parse_lines), 0, 0
+    start = len(BOM_UTF8) if text[: len(BOM_UTF8)].tobytes() == BOM_UTF8 else 0
+    parse, num_events = compiled(_parse_lines), 0
     while start < end:
         stop = min(start + BYTES_AT_A_TIME, end)
         while stop < end and text[stop - 1] != ord("\n"):

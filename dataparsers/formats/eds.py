@@ -34,7 +34,7 @@ from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import check_image_size, check_is_file, in_colour, of_file, read_json
+from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json, read_text
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.json_values import parse_array
@@ -250,11 +250,10 @@ def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4
     """The RGB camera, the event camera, and the pose of the first in the axes of the second."""
     import yaml
 
-    check_is_file(path, "a Kalibr camchain")
+    text = read_text(path, "a Kalibr camchain")
     try:
-        text = path.read_text(encoding="utf-8-sig")
         camchain = yaml.safe_load(text)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}," if mark else ""
         raise RecordingError(f"{path}{line} cannot be read as YAML, but a Kalibr camchain was expected.") from error

@@ -26,8 +26,9 @@ import numpy as np
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import of_file, reading
+from enerf_ns.dataparsers.files import of_file, read_text, reading
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.json_values import shown
 from enerf_ns.dataparsers.formats.robust_enerf import (
     checked_camera,
     checked_trajectory,
@@ -200,10 +201,11 @@ def _joined(held: list[np.ndarray]) -> Events:
 
 def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
     """Contrast thresholds, refractory period and Bayer pattern from a file of flags, of which the last one counts."""
-    with reading(path, "text"):
-        lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path, "flags of ESIM").splitlines()
     flags = dict(DEFAULT_FLAGS)
-    for line in map(str.strip, lines):
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if line and line[0] not in "-#":
+            raise RecordingError(f"{path}, line {number} is {shown(line)}, but a flag, as --NAME=VALUE, was expected.")
         name, _, value = line.lstrip("-").replace(" ", "=", 1).partition("=")
         if line.startswith("-") and name.removeprefix("no") == COLOUR:
             flags[COLOUR] = "false" if name.startswith("no") else value or "true"

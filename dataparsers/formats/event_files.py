@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_is_file
+from enerf_ns.dataparsers.files import reading
 from enerf_ns.dataparsers.recording import Events
 
 BYTES_AT_A_TIME = 2**18
@@ -69,13 +69,9 @@ def open_event_file(path: Path) -> EventFile:
         RecordingError: The file is missing, empty, cut off, damaged, of no known encoding or without events, or the
             package that reads it is not installed.
     """
-    try:
-        check_is_file(path, "an event file")
+    with reading(path, "an event file"), open(path, "rb") as file:
         num_bytes = path.stat().st_size
-        with open(path, "rb") as file:
-            begin = file.read(LARGEST_HEADER)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error}); give an event file.") from error
+        begin = file.read(LARGEST_HEADER)
     if not begin:
         raise RecordingError(f"{path} is empty; an event file was expected.")
     if begin.startswith(AEDAT4_MAGIC):

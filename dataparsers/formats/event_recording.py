@@ -32,7 +32,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.camera import COEFFICIENTS, Camera, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import load_array, of_file, read_json, write_whole
+from enerf_ns.dataparsers.files import load_array, load_image, of_file, read_json, write_whole
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
@@ -278,8 +278,11 @@ def _stream_events(folder: Path, columns: dict[str, np.memmap]) -> Iterator[Even
         count = min(EVENTS_AT_A_TIME, length - start)
         pieces = {name: _read_piece(folder / f"{name}.npy", column, start, count) for name, column in columns.items()}
         t = pieces.pop("t")
-        if t.max() >= LATEST or t.min() <= -LATEST:
-            raise RecordingError(f"{folder / 't.npy'} holds the time {t.max()} ns, which is beyond 146 years.")
+        extremes = int(t.min()), int(t.max())
+        if any(abs(time) >= LATEST for time in extremes):
+            raise RecordingError(
+                f"{folder / 't.npy'} holds the time {max(extremes, key=abs)} ns, which is beyond 146 years."
+            )
         yield Events(t=t.astype(np.int64, copy=False), **pieces)
 
 
@@ -410,6 +413,7 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
     digits = max(5, len(str(frames.numbers[-1])))
     names = [f"{number:0{digits}d}" for number in frames.numbers.tolist()]
     for name, source in zip(names, frames.filenames, strict=True):
+        load_image(source)  # which says so where it is damaged
         shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
     (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
     if frames.exposures is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_is_file
+from enerf_ns.dataparsers.files import read_text
 
 NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 
@@ -35,13 +35,7 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
     Raises:
         RecordingError: The file is missing, not text, empty, or has a row with another number of columns.
     """
-    try:
-        check_is_file(path, f"a text file with the columns {columns}")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path} is missing; a text file with the columns {columns} was expected.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path} cannot be read as text; expected were the columns {columns}.") from error
+    lines = read_text(path, f"a text file with the columns {columns}").splitlines()
     rows, numbers = [], []
     for number, line in enumerate(lines, start=1):
         cells = line.split()

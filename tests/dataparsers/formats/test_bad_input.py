@@ -99,7 +99,9 @@ DAVIS = [
     BadInput("calibration empty", write("calib.txt", ""), ("calib.txt is empty", "fx fy")),
     BadInput("list of frames empty", write("images.txt", ""), ("images.txt is empty", "t_s path")),
     BadInput(
-        "poses not text", write("groundtruth.txt", b"\xff\xfe\x00"), ("groundtruth.txt", "cannot be read as text")
+        "poses not text",
+        write("groundtruth.txt", b"\xff\xfe\x00"),
+        ("groundtruth.txt", "cannot be read as a text file"),
     ),
     BadInput(
         "event column missing", edit_line("events.txt", 3, "0.25 3 4"), ("events.txt, line 3 has 3 columns", "but 4")

@@ -617,7 +617,7 @@ RAW_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "stamps that stand": (edit(STAMPS, lambda lines: lines.__setitem__(1, lines[0])), f"{STAMPS}, line 2 has the time"),
     "a small image": (image((346, 260)), "has 346 x 260 pixels, but 640 x 480"),
     "no picture": (write("images/frame_0000000001.png", b"\x89PNG"), "frame_0000000001.png cannot be read as an image"),
-    "camchain of bytes": (write("camchain.yaml", b"\xff\xfe\x00cam0"), "cannot be read as YAML"),
+    "camchain of bytes": (write("camchain.yaml", b"\xff\xfe\x00cam0"), "cannot be read as a Kalibr camchain"),
     "camchain with a tab": (write("camchain.yaml", "cam0:\n\tcamera_model: omni\n"), "camchain.yaml, line 2, cannot"),
     "camchain unclosed": (write("camchain.yaml", "cam0: {fx: 1\n\ncam1: 2"), "camchain.yaml, line 3, cannot"),
     "camchain of OpenCV": (write("camchain.yaml", "%YAML:1.0\n---\nK: !!opencv-matrix\n"), "cannot be read as YAML"),

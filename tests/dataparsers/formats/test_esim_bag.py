@@ -331,7 +331,7 @@ BAD_INPUT = {
     ),
     "flags not text": (
         lambda folder: (folder / "esim.conf").write_bytes(b"\xff\xfe\x00"),
-        "esim.conf cannot be read as text",
+        "esim.conf cannot be read as flags of ESIM",
     ),
 }
 

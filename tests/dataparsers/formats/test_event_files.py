@@ -326,7 +326,7 @@ def test_bad_aedat4(tmp_path: Path, content: bytes, message: str):
 
 
 def test_missing_file(tmp_path: Path):
-    with pytest.raises(RecordingError, match="cannot be read"):
+    with pytest.raises(RecordingError, match="is missing"):
         open_event_file(tmp_path / "nothing.raw")
 
 
