@@ -23,7 +23,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence
+from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
 from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
@@ -111,8 +111,8 @@ class EventDataParser(DataParser):
             if not recording.has_frames:
                 raise RecordingError(
                     f"{recording.path} holds no frames to train on, from which this method learns; learn from its "
-                    f"events with ns-train enerf --data {recording.path}, or make frames of them with enerf "
-                    f"reconstruct {recording.path} --output-dir NEW and give that folder."
+                    f"events with ns-train enerf --data {quoted(recording.path)}, or make frames of them with enerf "
+                    f"reconstruct {quoted(recording.path)} --output-dir NEW and give that folder."
                 )
             return with_picture_files(self.outputs(recording, split))
 

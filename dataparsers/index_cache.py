@@ -6,6 +6,7 @@ renamed, so that it is whole or not there, however many processes build it at on
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -21,7 +22,7 @@ from platformdirs import user_cache_path
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
-from enerf_ns.dataparsers.files import partial_of
+from enerf_ns.dataparsers.files import expanded, partial_of
 
 LAYOUT = 3
 """Version of what is stored in an entry, counted up when that changes."""
@@ -36,10 +37,17 @@ BLOCK = 2**22
 
 
 def cache_folder() -> Path:
-    """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder."""
+    """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder.
+
+    Raises:
+        OSError: The user has no home folder.
+    """
     if "ENERF_CACHE" in os.environ:
-        return Path(os.environ["ENERF_CACHE"]).expanduser()
-    return user_cache_path("enerf-ns", appauthor=False) / "indices"
+        return expanded(os.environ["ENERF_CACHE"])
+    folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
+    if not folder.is_absolute():
+        raise FileNotFoundError(errno.ENOENT, "no home folder is known", str(folder))
+    return folder
 
 
 def entry_name(**made_from: object) -> str:
@@ -50,7 +58,10 @@ def entry_name(**made_from: object) -> str:
 
 def load_index(name: str) -> tuple[EventIndex, Survey] | None:
     """An index from the cache, mapped into memory; None where there is none. A damaged one is removed."""
-    folder = cache_folder() / name
+    try:
+        folder = cache_folder() / name
+    except OSError:
+        return None
     try:
         stored = json.loads((folder / "index.json").read_text())
         for column in COLUMNS:
@@ -96,7 +107,7 @@ def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]
             _store(name, survey, iter([(times, positives)]))
         except OSError as error:
             notes.append(
-                f"The index of {num_events:,} events could not be stored in {cache_folder()} "
+                f"The index of {num_events:,} events could not be stored in the cache "
                 f"({error.strerror or error}), so that the next start takes as long; make room, or set ENERF_CACHE to "
                 "another folder."
             )

@@ -29,7 +29,12 @@ def write_pictures(frames: Frames) -> list[Path]:
         RecordingError: A frame is missing or cannot be decoded.
         OutputError: A file cannot be written.
     """
-    places = [_place(frames, source) for source in frames.filenames]
+    try:
+        places = [_place(frames, source) for source in frames.filenames]
+    except OSError as error:
+        raise OutputError(
+            f"The undistorted pictures cannot be written ({error.strerror}); set ENERF_CACHE to a folder for them."
+        ) from error
     missing = [i for i, place in enumerate(places) if not _is_current(place, frames.filenames[i])]
     for i in track(missing, "Writing undistorted pictures", transient=True, disable=not missing):
         picture, state = frames.picture(i), frames.filenames[i].stat()

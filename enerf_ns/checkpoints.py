@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.terminal import say
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
@@ -65,12 +65,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 @cache
 def _say_passed_over(path: Path) -> None:
-    CONSOLE.print(
-        f"{path} is cut short or damaged; the checkpoint before it is used.",
-        soft_wrap=True,
-        markup=False,
-        style="yellow",
-    )
+    say(f"{path} is cut short or damaged; the checkpoint before it is used.")
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:

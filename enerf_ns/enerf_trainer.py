@@ -4,7 +4,6 @@ becomes of a run that is interrupted, or whose steps go wrong."""
 from __future__ import annotations
 
 import json
-import shlex
 import signal
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
@@ -22,6 +21,7 @@ from nerfstudio.utils.comms import is_main_process
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
+from rich.text import Text
 from torch import Tensor
 from tyro.conf import Fixed
 
@@ -35,8 +35,9 @@ from enerf_ns.checkpoints import (
     write_checkpoint,
 )
 from enerf_ns.choices import resolve
-from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence
-from enerf_ns.dataparsers.files import write_together
+from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence, printable, quoted
+from enerf_ns.dataparsers.files import absolute, write_together
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.encodings.hash_grid import fitting
@@ -100,11 +101,11 @@ class EnerfTrainerConfig(TrainerConfig):
         data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
         if data is None:
             raise FlagError("--data is missing; give the folder of a recording")
-        config.data = pipeline.datamanager.data = parser.data = data.expanduser().resolve()
-        config.output_dir = self.output_dir.expanduser().resolve()
+        config.data = pipeline.datamanager.data = parser.data = absolute(data)
+        config.output_dir = absolute(self.output_dir)
         config._check_output_dir()
-        config.load_dir = self.load_dir and self.load_dir.expanduser().resolve()
-        config.load_checkpoint = self.load_checkpoint and self.load_checkpoint.expanduser().resolve()
+        config.load_dir = self.load_dir and absolute(self.load_dir)
+        config.load_checkpoint = self.load_checkpoint and absolute(self.load_checkpoint)
         checkpoint = config.checkpoint()
         decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
         for name, group in config.optimizers.items():
@@ -129,6 +130,7 @@ class EnerfTrainerConfig(TrainerConfig):
         Raises:
             OutputError: It is the one that is set.
         """
+        check_outside_recordings("--output-dir", self.get_base_dir(), self.data)
         there = next(folder for folder in (self.output_dir, *self.output_dir.parents) if folder.exists())
         try:
             with TemporaryFile(dir=there):
@@ -171,8 +173,8 @@ class EnerfTrainerConfig(TrainerConfig):
             return own
         if own and self.load_dir != folder:
             raise OutputError(
-                f"{folder.parent} holds a run already; continue it with --load-config {folder.parent / 'config.yml'}, "
-                "or give the new one another --timestamp."
+                f"{folder.parent} holds a run already; continue it with --load-config "
+                f"{quoted(folder.parent / 'config.yml')}, or give the new one another --timestamp."
             )
         if self.load_dir and self.load_step is None:
             path = newest_checkpoint(self.load_dir)
@@ -221,7 +223,7 @@ class EnerfTrainerConfig(TrainerConfig):
             resolution = config.pipeline.resolution
             CONSOLE.print(recording_table(resolution.applied_to(config.pipeline).datamanager.dataparser))
             for line in resolution.selection:
-                CONSOLE.print(f"* {line}", highlight=False, markup=False)
+                CONSOLE.print(Text(f"* {printable(line)}"))
             CONSOLE.print(choices_table(resolution.choices))
             folder = config.get_base_dir()
             choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
@@ -229,7 +231,7 @@ class EnerfTrainerConfig(TrainerConfig):
                 write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
             except OSError as error:
                 raise _unwritable(folder, error) from error
-            say_where("configuration", str(folder / "config.yml"))
+            say_where("configuration", quoted(folder / "config.yml"))
 
     def setup(self, **kwargs: Any) -> EnerfTrainer:
         """The trainer, of what this config comes to on its recording."""
@@ -374,7 +376,7 @@ class EnerfTrainer(Trainer):
             raise SystemExit(
                 f"enerf: Training ended at step {self._trained}, since {self.base_dir} could not be written to "
                 f"({error.strerror or error}); the checkpoints there stay. Make room, and continue with ns-train "
-                f"{config.method_name} --load-config {shlex.quote(str(self.base_dir / 'config.yml'))}."
+                f"{config.method_name} --load-config {quoted(self.base_dir / 'config.yml')}."
             ) from error
         finally:
             if self._cores:
@@ -495,7 +497,7 @@ class EnerfTrainer(Trainer):
 
     def _after_train(self) -> None:
         self.step = self._trained  # where training was stopped, Nerfstudio has counted one further
-        config = shlex.quote(str(self.base_dir / "config.yml"))
+        config = quoted(self.base_dir / "config.yml")
         if self._trained + 1 < self._start_step + self.config.max_num_iterations:
             if self._trained >= self._start_step:
                 self.save_checkpoint(self._trained)
@@ -515,7 +517,7 @@ class EnerfTrainer(Trainer):
             numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
             say(f"The sensor as it was learned: {numbers}.")
         for what, where in {
-            "checkpoint": str(self.checkpoint_dir),
+            "checkpoint": quoted(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
             "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
             "video of your own": f"ns-render interpolate --load-config {config} --output-path video.mp4",

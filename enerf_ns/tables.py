@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rich.table import Table
+from rich.text import Text
 
 from enerf_ns.choices import Choice
+from enerf_ns.dataparsers.errors import printable
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
@@ -41,11 +43,12 @@ def recording_table(parser: EventDataParserConfig) -> Table:
         rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
     table = Table(title="Recording", show_header=False, title_justify="left")
     for name, value in rows.items():
-        table.add_row(name, value)
+        table.add_row(name, Text(printable(value)))
     for note in (*recording.notes, *index.notes):
-        table.add_row("note", f"[yellow]{note}[/yellow]")
+        table.add_row("note", Text(printable(note), "yellow"))
     for problem in find_problems(recording, depth):
-        table.add_row("[red]problem[/red]", f"[red]{problem.what}[/red] {problem.advice}")
+        what, advice = printable(problem.what), printable(problem.advice)
+        table.add_row(Text("problem", "red"), Text.assemble((what, "red"), f" {advice}"))
     return table
 
 
@@ -58,5 +61,6 @@ def choices_table(choices: Sequence[Choice]) -> Table:
         table.add_column(column, overflow="fold")
     for choice in choices:
         kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
-        table.add_row(choice.part, kept, choice.value, choice.why, f"[dim]{choice.flag.removeprefix(prefix)}[/dim]")
+        flag = Text(choice.flag.removeprefix(prefix), "dim")
+        table.add_row(choice.part, kept, Text(choice.value), Text(choice.why), flag)
     return table

@@ -11,9 +11,11 @@ from unittest.mock import patch
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.control import Control
-from rich.markup import escape
 from rich.panel import Panel
 from rich.segment import ControlType
+from rich.text import Text
+
+from enerf_ns.dataparsers.errors import printable
 
 REWRITTEN_EVERY, PRINTED_EVERY = 0.25, 30.0
 """Seconds between two states of the line on a terminal, and where lines cannot be rewritten."""
@@ -49,22 +51,26 @@ def clear_line() -> None:
 def say(sentence: str) -> None:
     """Prints what a person should know, in yellow."""
     clear_line()
-    CONSOLE.print(sentence, soft_wrap=True, markup=False, highlight=False, style="yellow")
+    CONSOLE.print(Text(printable(sentence), "yellow"), soft_wrap=True)
 
 
 def say_where(what: str, where: str) -> None:
-    """Prints a place, or a command, on one line, however long it is, so that it can be copied."""
-    CONSOLE.print(f"[bold]{what}:[/bold] {escape(where)}", soft_wrap=True, highlight=False)
+    """Prints a place, or a command, on one line, however long it is, so that it can be copied; with paths `quoted`."""
+    CONSOLE.print(Text.assemble((f"{what}:", "bold"), f" {where}"), soft_wrap=True)
 
 
 CHATTER = (
     "Mixed precision is disabled",
     "Saving checkpoints to",
+    "[bold yellow]logging events to",
+    "Loading latest checkpoint from load_dir",
+    ":white_check_mark: Done loading checkpoint from",
+    "Done loading Nerfstudio checkpoint from",
     "No Nerfstudio checkpoint to load",
     "[bold yellow]Disabled comet",
     "disabled local writer",
 )
-"""How lines of Nerfstudio begin that tell a person nothing."""
+"""How lines of Nerfstudio begin that tell a person nothing, or a path in which brackets are taken for colours."""
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from enerf_ns.dataparsers.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.files import partial_of, read_json, write_whole
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording import EventRecording
@@ -139,8 +140,7 @@ def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
         )
-    if output_dir == source or source in output_dir.parents:
-        raise OutputError(f"--output-dir {output_dir} lies in the recording, which is only read; give another one.")
+    check_outside_recordings("--output-dir", output_dir, source)
     partial = partial_of(output_dir)
     try:
         partial.mkdir(parents=True)
@@ -149,8 +149,12 @@ def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
             output_dir.rmdir()
         partial.rename(output_dir)
     except OSError as error:
+        refused = partial if error.filename is None else Path(os.fsdecode(error.filename))
+        if not (refused.is_relative_to(partial) or partial.is_relative_to(refused)):
+            raise  # what is read
         raise OutputError(
-            f"{output_dir} could not be written ({error}), and nothing was left there; is the disk full?"
+            f"{output_dir} could not be written ({error.strerror}), and nothing was left there; make room, or give "
+            "another --output-dir."
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)

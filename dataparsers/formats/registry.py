@@ -11,14 +11,17 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import of_file
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.files import absolute, of_file
 from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
+
+FILES_OF_A_RECORDING = 2
+"""Files of a format by which a folder is known for a recording that nothing is written to."""
 
 
 def register(format: Format) -> None:
@@ -76,7 +79,7 @@ def read_recording(
         RecordingError: The folder is of no known format, or anything in it cannot be used.
         FlagError: There is no such format, it lacks an option, or the range of time cannot be used.
     """
-    found = _read_folder(Path(path).resolve(), format, **options)
+    found = _read_folder(absolute(path), format, **options)
     return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort)
 
 
@@ -137,9 +140,34 @@ def _check_options(path: Path, found: Format, options: dict[str, object]) -> Non
             raise FlagError(f"{flag} {whose}, but {path} is read as {found.name}; leave it out.")
 
 
+def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> None:
+    """Refuses a place for results within a recording, which nothing is ever written to, or that is itself read.
+
+    Args:
+        flag: That gives the place.
+        output: A file or a folder, there or not.
+        read: Files and folders that the results come from; any other folder with `FILES_OF_A_RECORDING` of a format's
+            files is taken for a recording too.
+
+    Raises:
+        OutputError: The place lies in one of them, or is one.
+    """
+    output = absolute(output)
+    sources = {absolute(path) for path in read if path is not None}
+    for place in (output, *output.parents):
+        if place in sources or max(_files_found(place).values()) >= FILES_OF_A_RECORDING:
+            where = "lies within the recording" if place.is_dir() else "would replace the file"
+            raise OutputError(f"{flag} {output} {where} {place}, which is never written to; give a place elsewhere.")
+
+
+def _files_found(path: Path) -> dict[Format, int]:
+    """How many of the files of each format lie in a folder."""
+    return {format: sum(any(path.glob(pattern)) for pattern in format.files) for format in formats()}
+
+
 def _find_format(path: Path) -> Format:
     """Of the formats, the one most of whose files lie in a folder."""
-    found = {format: sum(any(path.glob(pattern)) for pattern in format.files) for format in formats()}
+    found = _files_found(path)
     best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) == 1:
         return best[0]

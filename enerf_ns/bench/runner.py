@@ -29,7 +29,8 @@ from enerf_ns.bench.measures import TRUTH, evaluate
 from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.bench.tables import csv_table, markdown
 from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import partial_of, read_json, write_whole
+from enerf_ns.dataparsers.files import absolute, expanded, partial_of, read_json, write_whole
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.enerf_trainer import EnerfTrainerConfig
 from enerf_ns.evaluation.lpips import NETWORKS, Net
 from enerf_ns.evaluation.runs import method_config, set_up, train
@@ -96,7 +97,7 @@ class Bench:
         }
         self.rows = tuple(row for row in rows if row not in self.left_out)
         weights = settings.reconstruction_weights
-        if weights is not None and not weights.expanduser().is_file():
+        if weights is not None and not expanded(weights).is_file():
             raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
         parse_budget(settings.budget)
         if not 0.0 < settings.scale <= 4.0:
@@ -109,7 +110,8 @@ class Bench:
                 raise FlagError(f"--threads is {settings.threads}, but must be from 1 to {most}.")
             numba.set_num_threads(settings.threads)  # starts OpenMP, with a number of threads of its own for torch, too
             torch.set_num_threads(settings.threads)
-        self.output_dir = settings.output_dir.expanduser().resolve()
+        self.output_dir = absolute(settings.output_dir)
+        check_outside_recordings("--output-dir", self.output_dir)
 
     @property
     def cells(self) -> list[Cell]:
@@ -219,7 +221,7 @@ class Bench:
             "preset": sequence.preset,
             "recording": str(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
             "reconstruction": row.reconstruction,
-            "weights": weights and hashlib.sha256(weights.expanduser().read_bytes()).hexdigest(),
+            "weights": weights and hashlib.sha256(expanded(weights).read_bytes()).hexdigest(),
             "budget": settings.budget,
             "protocols": self.experiment.protocols,
             "vgg": "lpips_vgg" in self.experiment.columns,
@@ -302,7 +304,7 @@ class Bench:
     def _recorded(self, cell: Cell) -> Path:
         """Where the user has a recording."""
         assert self.settings.data is not None
-        data = self.settings.data.expanduser().resolve()
+        data = absolute(self.settings.data)
         return data / cell.sequence if (data / cell.sequence).is_dir() or len(self.sequences) > 1 else data
 
     def _recording(self, cell: Cell) -> Path:
@@ -337,7 +339,7 @@ class Bench:
         frames = self.output_dir / "recordings" / f"{cell.sequence}-{row.reconstruction}-{of}"
         with _made_whole(frames) as folder:
             if folder is not None:
-                reconstruct(recording, folder, weights and weights.expanduser())
+                reconstruct(recording, folder, weights and expanded(weights))
         return frames
 
     def _file(self, name: str, content: str) -> Path:

@@ -147,8 +147,11 @@ def load_any_method(
         raise RecordingError(f"{config_file} {found}; give the config.yml of a trained run.")
     from nerfstudio.utils.eval_utils import eval_setup
 
+    from enerf_ns.terminal import without_chatter
+
     try:
-        return eval_setup(config_file, test_mode=test_mode)[:2]
+        with without_chatter():
+            return eval_setup(config_file, test_mode=test_mode)[:2]
     except (Exception, SystemExit) as error:  # whatever of a run is missing or of another version
         reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
         if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):

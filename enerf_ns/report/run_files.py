@@ -11,7 +11,7 @@ import yaml
 
 from enerf_ns.checkpoints import newest_checkpoint
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import reading
+from enerf_ns.dataparsers.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class RunFiles:
 def find_runs(path: Path) -> list[Path]:
     """The folders of the runs in a folder and all folders below it, by name; the path itself where there are none, or
     where it is a file."""
-    path = path.expanduser()
+    path = expanded(path)
     if (path / "config.yml").exists():
         return [path]
     return sorted(file.parent for file in path.rglob("config.yml")) or [path]
@@ -74,7 +74,7 @@ def read_run(path: Path) -> RunFiles:
     from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.engine.trainer import TrainerConfig
 
-    path = path.expanduser().resolve()
+    path = absolute(path)
     config_file = path / "config.yml" if path.is_dir() else path
     if not config_file.exists():
         found = "holds no config.yml" if path.is_dir() else "does not exist"

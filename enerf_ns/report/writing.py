@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError, quoted
 from enerf_ns.dataparsers.files import fill_page, write_together
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
@@ -106,8 +107,7 @@ def write_report(
         OutputError: The folder cannot be written to, or the disk is full, or it lies within a recording.
     """
     reported, unread = _read(runs)
-    for one in reported:
-        _check_outside(output_dir, one.files.config.data)
+    check_outside_recordings("--output-dir", output_dir, *(one.files.config.data for one in reported))
     with _writing_to(output_dir):
         output_dir.mkdir(parents=True, exist_ok=True)
     loaded = {run.config_file.resolve(): run for run in runs if isinstance(run, Run)}
@@ -147,15 +147,6 @@ def _read(runs: Sequence[Run | Path]) -> tuple[list[_Reported], dict[str, str]]:
             one.prefix = f"{plain if plain not in prefixes else f'{plain}-{number}'}/"
             prefixes.add(one.prefix[:-1])
     return reported, unread
-
-
-def _check_outside(output_dir: Path, recording: Path | None) -> None:
-    """Raises an OutputError where a folder lies within a recording."""
-    if recording is not None and output_dir.expanduser().resolve().is_relative_to(recording):
-        raise OutputError(
-            f"--output-dir {output_dir} lies within the recording {recording}, which is never written to; give a "
-            "folder elsewhere."
-        )
 
 
 @contextmanager
@@ -241,7 +232,7 @@ def _loaded(one: _Reported) -> Run | None:
     if recording is not None and not recording.exists():
         one.notes.append(
             f"The recording {recording} is not there any more, {left_out}: put it back, or a link to it (ln -s NEW "
-            f"{recording}), and call enerf report again."
+            f"{quoted(recording)}), and call enerf report again."
         )
         return None
     if not one.files.stored:

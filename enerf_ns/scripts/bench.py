@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from enerf_ns.bench.settings import BenchSettings
+from enerf_ns.dataparsers.errors import printable
 
 CONSOLE = Console(width=140)
 
@@ -35,20 +36,18 @@ class Bench:
         for cell, result in bench.run():
             name = f"[{numbers[cell]}/{len(numbers)}] {cell.sequence}, {cell.row}, seed {cell.seed}"
             if result is None:
-                CONSOLE.print(f"{name} …", markup=False, highlight=False)
+                print(f"{name} …", flush=True)
                 continue
             results.append(result)
             told = result.get("failure") or f"{result['seconds']:.0f} s, {result['steps']} steps"
-            CONSOLE.print(f"{name}: {told}", markup=False, highlight=False, soft_wrap=True)
+            print(printable(f"{name}: {told}"), flush=True)
         told = bench.results(results)
         CONSOLE.print(rich_table(told))
         for remark in remarks(told):
-            CONSOLE.print(f"* {remark}", markup=False, highlight=False, soft_wrap=True)
+            print(printable(f"* {remark}"))
         where = bench.output_dir / self.experiment
         drawn = "; error against time in .png" if where.with_suffix(".png").exists() else ""
-        CONSOLE.print(
-            f"The table is in {where}.md, .json and .csv{drawn}", markup=False, highlight=False, soft_wrap=True
-        )
+        print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
 
 
 def _experiments() -> Table:

@@ -27,9 +27,12 @@ class CheckNumerics:
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
 
+        from enerf_ns.dataparsers.formats.registry import check_outside_recordings
         from enerf_ns.numerics.all_cases import CASES
         from enerf_ns.numerics.case import as_json, as_markdown, run
 
+        if self.output_dir is not None:
+            check_outside_recordings("--output-dir", self.output_dir)
         results = [run(case) for case in track(CASES, "Checking", console=CONSOLE, transient=True)]
         CONSOLE.print(results_table(results))
         if self.output_dir is not None:

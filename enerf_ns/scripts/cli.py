@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from importlib import import_module
 
 import tyro
 
 from enerf_ns import __version__
-from enerf_ns.dataparsers.errors import UserError
+from enerf_ns.dataparsers.errors import exit_with_a_sentence, printable
 from enerf_ns.quiet import silence_known_warnings
 
 COMMANDS = {
@@ -50,11 +51,11 @@ def _print_help() -> None:
 def _run(name: str, arguments: list[str]) -> None:
     command = getattr(import_module(f"enerf_ns.scripts.{name.replace('-', '_')}"), COMMANDS[name][0])
     try:
-        tyro.cli(command, prog=f"enerf {name}", args=arguments).main()
-    except UserError as error:
-        raise SystemExit(f"enerf: {error}") from error
+        with exit_with_a_sentence():
+            tyro.cli(command, prog=f"enerf {name}", args=arguments).main()
     except MemoryError as error:
-        raise SystemExit("enerf: There is not enough memory for this; ask for less at a time.") from error
+        asked = printable(shlex.join(["enerf", name, *arguments]))
+        raise SystemExit(f"enerf: There is not enough memory for {asked}; ask for less at a time.") from error
     except KeyboardInterrupt as error:
         print("enerf: Stopped.", file=sys.stderr)
         raise SystemExit(130) from error

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError, printable
+from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording
 from enerf_ns.scripts.format_options import format_flags
-
-CONSOLE = Console(width=120)
 
 
 @dataclass
@@ -33,7 +31,7 @@ class Convert:
     """For an event file: a JSON file with width, height, model, fx, fy, cx, cy and distortion."""
 
     def main(self) -> None:
-        source, output_dir = self.source.expanduser().resolve(), self.output_dir.expanduser().resolve()
+        source, output_dir = absolute(self.source), absolute(self.output_dir)
         if not source.exists():
             raise RecordingError(f"{source} does not exist; give the folder of a recording or an event file.")
         chosen = self.options.given()
@@ -41,7 +39,7 @@ class Convert:
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"
                 raise FlagError(f"{flag} is for folders of recordings, but {source} is a file; leave it out.")
-            poses, camera = (path and path.expanduser() for path in (self.poses, self.camera))
+            poses, camera = (path and expanded(path) for path in (self.poses, self.camera))
             sentences = convert_event_file(source, output_dir, poses, self.poses_unit, camera)
         else:
             for flag, value in (("--poses", self.poses), ("--camera", self.camera)):
@@ -49,5 +47,5 @@ class Convert:
                     raise FlagError(f"{flag} is for event files, but {source} is a folder with its own; leave it out.")
             sentences = convert_recording(source, output_dir, **chosen)
         for sentence in sentences:
-            CONSOLE.print(sentence, soft_wrap=True, highlight=False, markup=False)
-        CONSOLE.print(f"The recording is in {output_dir}", soft_wrap=True, highlight=False, markup=False)
+            print(printable(sentence))
+        print(printable(f"The recording is in {output_dir}"))

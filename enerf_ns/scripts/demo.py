@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from enerf_ns.dataparsers.errors import printable
+from enerf_ns.dataparsers.files import absolute
+
 
 @dataclass
 class Demo:
@@ -18,22 +21,24 @@ class Demo:
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
 
+        from enerf_ns.dataparsers.formats.registry import check_outside_recordings
         from enerf_ns.evaluation.runs import method_config, train
         from enerf_ns.ranges import check_ranges
         from enerf_ns.report.writing import write_report
         from enerf_ns.scripts.simulate import Simulate
         from enerf_ns.simulator.settings import SimulationSettings
 
-        output_dir = self.output_dir.expanduser().resolve()
+        output_dir = absolute(self.output_dir)
+        check_outside_recordings("--output-dir", output_dir)
         recording = output_dir / "recording"
         config = method_config("enerf", recording, output_dir / "runs")
         if self.max_num_iterations is not None:
             config.max_num_iterations = self.max_num_iterations
         check_ranges(config)
         if recording.exists():
-            CONSOLE.print(f"The recording in {recording} is used again; remove it to simulate anew.", markup=False)
+            print(printable(f"The recording in {recording} is used again; remove it to simulate anew."))
         else:
             Simulate(recording, SimulationSettings("shapes")).main()
         run = train(config)
         CONSOLE.print(write_report([run], output_dir))
-        CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+        print(printable(f"The report is {output_dir / 'report.html'}"))

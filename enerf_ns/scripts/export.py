@@ -10,8 +10,9 @@ from typing import Annotated, Literal, Optional  # tyro reads these annotations 
 import numpy as np
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.files import write_together
+from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError, printable
+from enerf_ns.dataparsers.files import absolute, expanded, write_together
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 
 SUFFIXES = (".ply", ".glb")
 
@@ -39,8 +40,6 @@ class Export:
     """Mesh that the result is scored against, in metres, in the axes of the recording. None: the simulated scene."""
 
     def main(self) -> None:
-        from nerfstudio.utils.rich_utils import CONSOLE
-
         from enerf_ns.evaluation.runs import load
         from enerf_ns.export.scoring import simulated_scene, surface_scores
         from enerf_ns.export.surface import fused, pixel_size, points_of, surface_views
@@ -50,20 +49,16 @@ class Export:
         if self.voxel is not None and not 0.0 < self.voxel < np.inf:
             raise FlagError(f"--voxel is {self.voxel:g}, but must be metres above 0.")
         files = read_run(self.run)
-        recording = files.config.data
-        output = (self.output or files.config_file.parent / f"{self.what}.ply").expanduser().resolve()
+        output = absolute(self.output or files.config_file.parent / f"{self.what}.ply")
         if output.suffix not in SUFFIXES:
             raise FlagError(f"--output {output} ends with neither .ply nor .glb; give a file that does.")
         if output.is_dir():
             raise OutputError(f"--output {output} is a folder; give the name of a file.")
-        if recording is not None and output.is_relative_to(recording.resolve()):
-            raise OutputError(
-                f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
-            )
+        check_outside_recordings("--output", output, files.config.data, self.reference)
         if not files.stored:
             raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
         notes: list[str] = []
-        scene = load_scene(self.reference.expanduser(), np.random.default_rng(0), notes) if self.reference else None
+        scene = load_scene(expanded(self.reference), np.random.default_rng(0), notes) if self.reference else None
 
         pipeline = load(files.config_file).pipeline
         path = pipeline.datamanager.recording.path
@@ -92,4 +87,4 @@ class Export:
         except OSError as error:
             raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
         for line in [*(f"note: {note}" for note in notes), *lines]:
-            CONSOLE.print(line, soft_wrap=True, highlight=False, markup=False)
+            print(printable(line))

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.files import write_whole
-from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.errors import OutputError, printable
+from enerf_ns.dataparsers.files import absolute, write_whole
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.inspection import Inspection
 from enerf_ns.scripts.format_options import format_flags
 
@@ -29,14 +29,11 @@ class Inspect:
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 
     def main(self) -> None:
-        data = self.data.expanduser().resolve()
-        output = (self.output or Path(f"inspect-{data.name}.html")).expanduser().resolve()
+        data = absolute(self.data)
+        output = absolute(self.output or Path(f"inspect-{data.name}.html"))
         if output.is_dir():
             raise OutputError(f"--output {output} is a folder; give the name of an HTML file.")
-        if output.is_relative_to(data):
-            raise OutputError(
-                f"--output {output} lies within the recording, which is never written to; give a file elsewhere."
-            )
+        check_outside_recordings("--output", output, data)
         inspection = Inspection.of(read_recording(data, **self.options.given()))
         inspection.print_tables(CONSOLE)
         page = inspection.page()
@@ -45,4 +42,4 @@ class Inspect:
         except OSError as error:
             reason = f"could not be written ({error.strerror})"
             raise OutputError(f"--output {output} {reason}; give another file.") from error
-        CONSOLE.print(f"Pictures are in {output}", soft_wrap=True, highlight=False, markup=False)
+        print(printable(f"Pictures are in {output}"))

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import RecordingError, printable, quoted
+from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.reconstruction.reconstruction import reconstruct
 from enerf_ns.scripts.format_options import format_flags
-
-CONSOLE = Console(width=120)
 
 
 @dataclass
@@ -34,18 +31,13 @@ class Reconstruct:
     """For a recording without frames. None: 30. Otherwise, frames are made at the instants of those that there are."""
 
     def main(self) -> None:
-        source, output_dir = self.source.expanduser().resolve(), self.output_dir.expanduser().resolve()
+        source, output_dir = absolute(self.source), absolute(self.output_dir)
         if not source.is_dir():
             raise RecordingError(f"{source} is not a folder; give that of a recording.")
-        weights = self.weights and self.weights.expanduser()
+        weights = self.weights and expanded(self.weights)
         chosen = self.options.given()
         sentences = reconstruct(source, output_dir, weights, self.frames_per_second, self.cutoff_frequency, **chosen)
         for sentence in sentences:
-            CONSOLE.print(sentence, soft_wrap=True, highlight=False, markup=False)
-        CONSOLE.print(
-            f"The recording is in {output_dir}\n"
-            f"train: ns-train enerf --data {shlex.quote(str(output_dir))} --pipeline.datamanager.supervision frames",
-            soft_wrap=True,
-            highlight=False,
-            markup=False,
-        )
+            print(printable(sentence))
+        print(printable(f"The recording is in {output_dir}"))
+        print(f"train: ns-train enerf --data {quoted(output_dir)} --pipeline.datamanager.supervision frames")

@@ -8,6 +8,8 @@ from typing import Annotated, Optional  # tyro reads these annotations on Python
 
 import tyro
 
+from enerf_ns.dataparsers.errors import printable
+from enerf_ns.dataparsers.files import absolute
 from enerf_ns.report.scoring import Scoring
 
 
@@ -39,7 +41,7 @@ class Report:
         output_dir = self.output_dir
         if output_dir is None and len(runs) == 1:
             output_dir = runs[0] if runs[0].is_dir() else runs[0].parent
-        output_dir = (output_dir or Path("report")).expanduser().resolve()
+        output_dir = absolute(output_dir or Path("report"))
         scores = write_report(runs, output_dir, self.reach, self.scoring, self.video)
         CONSOLE.print(scores)
-        CONSOLE.print(f"The report is {output_dir / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+        print(printable(f"The report is {output_dir / 'report.html'}"))

@@ -3,21 +3,17 @@ time: scenes made from a seed, meshes, folders of images, videos, trained runs."
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Optional  # tyro reads these annotations on Python 3.10
 
 import tyro
-from rich.console import Console
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.errors import FlagError, printable, quoted
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings
-
-CONSOLE = Console(width=120)
 
 
 @dataclass
@@ -43,13 +39,13 @@ class Simulate:
             settings = replace(settings, sensor=sensor)
         made = simulate(settings, self.output_dir, self.preview)
         for note in made.notes:
-            CONSOLE.print(f"note: {note}", highlight=False, markup=False)
+            print(printable(f"note: {note}"))
         lines = [
             f"{made.num_events:,} events and {made.num_frames} frames of {made.duration * 1e-9:g} s are in "
             f"{made.folder}"
         ]
         if made.has_poses and made.num_events:
-            folder = shlex.quote(str(made.folder))
+            folder = quoted(made.folder)
             lines += [f"look at it: enerf inspect {folder}", f"train: ns-train enerf --data {folder}"]
         for line in lines:
-            CONSOLE.print(line, soft_wrap=True, highlight=False, markup=False)
+            print(printable(line))

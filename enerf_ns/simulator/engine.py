@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.formats.registry import open_writer, writer_of
+from enerf_ns.dataparsers.files import absolute
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings, open_writer, writer_of
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.sensor.response import ColourFilter, luma, pixel_brightness, response_named
@@ -64,9 +65,11 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
     Raises:
         FlagError: A setting is out of its range, contradicts another, or changes nothing.
         RecordingError: An input cannot be read or used.
-        OutputError: The folder is not empty or cannot be made, or the preview cannot be written.
+        OutputError: The folder is not empty, lies within a recording or what else is read, or cannot be made, or the
+            preview cannot be written.
     """
-    output_dir = output_dir.expanduser().resolve()
+    output_dir = absolute(output_dir)
+    check_outside_recordings("--output-dir", output_dir, *settings.reads)
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads the
 import tyro
 
 from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.files import expanded
 from enerf_ns.dataparsers.formats.registry import layouts, writer_of
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
@@ -92,8 +93,15 @@ class SimulationSettings:
         """The folder of images or the video that is seen, if it is one."""
         if self.scene is None or self.scene in PRESETS or self.scene in SCENES:
             return None
-        path = Path(self.scene).expanduser()
+        path = expanded(self.scene)
         return path if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES else None
+
+    @property
+    def reads(self) -> tuple[Path, ...]:
+        """The folders and files that the simulation is made from."""
+        scene = self.scene if self.scene not in {*PRESETS, *SCENES, None} else None
+        read = (scene, self.from_run, self.key_frames, self.trajectory, self.cameras, self.stamps)
+        return tuple(Path(path) for path in read if path)
 
     @property
     def preset(self) -> SimulationPreset | None:
@@ -152,7 +160,7 @@ def _check_ranges(settings: SimulationSettings) -> None:
 def _check_use(settings: SimulationSettings, layout: str) -> None:
     """Refuses settings that would change nothing."""
     pictures, trajectory = settings.pictures, settings.trajectory
-    poses_file = trajectory is not None and not trajectory.expanduser().is_dir()
+    poses_file = trajectory is not None and not expanded(trajectory).is_dir()
     sizes = ("--width", "--height", "--field-of-view")
     rig = writer_of(layout).published_rig
     own_rig = rig is not None and settings.cameras is None and settings.from_run is None and pictures is None

@@ -204,7 +204,7 @@ class ImageFolder(Pictures):
 
     def _decode(self, file: Path) -> np.ndarray:
         picture = load_image(file)  # which says what is wrong with a file, but gives 8 bits
-        stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        stored = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
         if stored is not None and stored.dtype == np.uint16:
             picture = np.atleast_3d(stored)
             if picture.shape[2] == 4:

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.dataparsers.formats.event_recording import read_cameras
 from enerf_ns.dataparsers.formats.registry import writer_of
 from enerf_ns.dataparsers.formats.writer import is_second_camera
@@ -76,7 +77,7 @@ def view_of(settings: SimulationSettings, notes: list[str]) -> View:
 def _pictures_view(settings: SimulationSettings, path: Path) -> View:
     rate, response = settings.frames_per_second, response_named(settings.sensor.response)
     if path.is_dir():
-        stamps = settings.stamps and settings.stamps.expanduser()
+        stamps = settings.stamps and expanded(settings.stamps)
         source = ImageFolder(path, rate, stamps, gamma=settings.gamma, response=response)
     else:
         source = Video(path, rate, settings.gamma, response)
@@ -86,7 +87,7 @@ def _pictures_view(settings: SimulationSettings, path: Path) -> View:
 
 def _run_view(settings: SimulationSettings, config: Path, notes: list[str]) -> View:
     duration = _duration(settings) or round(SECONDS * 1e9)
-    run = TrainedRun(config.expanduser().resolve(), _given_trajectory(settings, notes), duration)
+    run = TrainedRun(absolute(config), _given_trajectory(settings, notes), duration)
     if settings.width or settings.height or settings.field_of_view:
         run.camera = _pinhole(settings, run.camera)
     end = _end(settings, run.end, str(settings.trajectory or settings.key_frames or config))
@@ -131,7 +132,7 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
     if name in SCENES:
         scene = SCENES[name](rng)
     else:
-        path = Path(name).expanduser()
+        path = expanded(name)
         if not path.exists():
             raise RecordingError(
                 f"{name} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file or "
@@ -165,9 +166,9 @@ def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator
 
 def _given_trajectory(settings: SimulationSettings, notes: list[str]) -> Trajectory | None:
     if settings.key_frames is not None:
-        return key_frames(settings.key_frames.expanduser())
+        return key_frames(expanded(settings.key_frames))
     if settings.trajectory is not None:
-        return from_file(settings.trajectory.expanduser(), notes, settings.trajectory_unit)
+        return from_file(expanded(settings.trajectory), notes, settings.trajectory_unit)
     return None
 
 
@@ -176,7 +177,7 @@ def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
     assert settings.layout is not None
     rig = writer_of(settings.layout).published_rig
     if settings.cameras is not None:
-        rig = read_cameras(settings.cameras.expanduser())
+        rig = read_cameras(expanded(settings.cameras))
     elif rig is None:
         camera = _pinhole(settings)
         rig = camera, camera, np.eye(4)

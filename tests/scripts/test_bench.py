@@ -14,16 +14,14 @@ from enerf_ns.scripts.cli import entrypoint
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch):
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Calls `enerf bench`; returns what it prints."""
 
     def call_bench(*arguments: str) -> str:
-        console = Console(width=300)
-        monkeypatch.setattr(bench, "CONSOLE", console)
+        monkeypatch.setattr(bench, "CONSOLE", Console(width=300))
         monkeypatch.setattr(sys, "argv", ["enerf", "bench", *arguments])
-        with console.capture() as shown:
-            entrypoint()
-        return shown.get()
+        entrypoint()
+        return capsys.readouterr().out
 
     return call_bench
 

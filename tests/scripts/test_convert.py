@@ -171,7 +171,7 @@ def test_a_folder_with_something_in_it_is_not_touched(tmp_path: Path):
 
 def test_a_folder_within_the_recording_is_refused(tmp_path: Path):
     source = write_esim(tmp_path / "esim")
-    assert "lies in the recording, which is only read" in refused(tmp_path, Convert(source, source / "deep" / "new"))
+    assert "lies within the recording" in refused(tmp_path, Convert(source, source / "deep" / "new"))
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path):

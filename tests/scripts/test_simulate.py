@@ -10,26 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from enerf_ns.scripts import simulate
 from enerf_ns.scripts.cli import entrypoint
 
 SHORT = ("--duration", "0.1", "--num-frames", "11", "--exposure-ms", "2", "--width", "16", "--height", "12")
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., list[str]]:
+def call(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., list[str]]:
     """Calls `enerf simulate` for a short recording in an empty working directory; returns the lines it prints."""
     monkeypatch.chdir(tmp_path)
 
     def call_simulate(*arguments: str) -> list[str]:
-        console = Console(width=1000)
-        monkeypatch.setattr(simulate, "CONSOLE", console)
         monkeypatch.setattr(sys, "argv", ["enerf", "simulate", *arguments, *SHORT])
-        with console.capture() as shown:
-            entrypoint()
-        return shown.get().splitlines()
+        entrypoint()
+        return [line for line in capsys.readouterr().out.splitlines() if line]  # of a progress bar, an empty one
 
     return call_simulate
 

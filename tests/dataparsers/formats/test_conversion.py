@@ -51,7 +51,7 @@ def test_options_that_the_format_lacks_and_folders_within(tmp_path: Path):
     source = write_esim(tmp_path / "esim")
     with pytest.raises(FlagError, match="--event-camera is for recordings of tum_vie"):
         convert_recording(source, tmp_path / "new", event_camera="right")
-    with pytest.raises(OutputError, match="lies in the recording, which is only read"):
+    with pytest.raises(OutputError, match="lies within the recording"):
         convert_recording(source, source / "new")
     with pytest.raises(RecordingError, match="is a folder of no known format"):
         (tmp_path / "empty").mkdir()
