@@ -12,10 +12,11 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import psutil
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Float, Shaped, UInt8
+from PIL import Image, UnidentifiedImageError
 
 from enerf_ns.dataparsers.errors import FlagError, RecordingError, UserError
 
@@ -136,24 +137,73 @@ def read_text(path: Path, expected: str) -> str:
         return path.read_text(encoding="utf-8-sig")
 
 
-def load_image(path: Path) -> UInt8[np.ndarray, "height width channels"]:
-    """An image file as uint8 with one or three channels; what is transparent is laid over white, 16 bits become 8.
+def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
+    """An image file with one or three channels and the values that it holds: uint8, uint16 or float32.
+
+    What is transparent is laid over white. What 16 bits and floats are of full brightness, the file does not say; see
+    `picture_depth`.
 
     Raises:
-        RecordingError: The file is missing or cannot be decoded.
+        RecordingError: The file is missing or cannot be decoded, or holds other values, or floats that are below 0 or
+            no numbers.
     """
     with reading(path, "an image"):
+        if is_deep(path):
+            return _load_deep(path)
         with Image.open(path) as image:
             image.verify()  # the checksums of a PNG, which decoding passes over
         with Image.open(path) as image:
-            if image.mode.startswith("I"):
-                return (np.asarray(image).clip(0, 65535) // 256).astype(np.uint8)[..., None]
             grey = image.mode in ("1", "L", "LA")
             if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info:
                 colours = image.convert("RGBA")
                 image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colours)
             pixels = np.array(image.convert("L" if grey else "RGB"))
         return pixels[..., None] if grey else pixels
+
+
+def is_deep(path: Path) -> bool:
+    """Whether an image has more than 8 bits a channel, from the header only.
+
+    Raises:
+        RecordingError: The file is missing.
+    """
+    with reading(path, "an image"):
+        try:
+            with Image.open(path) as image:
+                decoder = image.tile[0][3] if image.tile else ""
+                mode, *rest = decoder if isinstance(decoder, tuple) else (decoder,)
+                is_deep_ppm = image.format == "PPM" and bool(rest) and rest[0] > 255
+                return image.mode.startswith(("I", "F")) or ";16" in str(mode) or is_deep_ppm
+        except UnidentifiedImageError:  # such as TIFF with floats of three channels, which OpenCV reads
+            return True
+
+
+def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
+    """An image of more than 8 bits a channel, uint16 or float32; in the words of `load_image`."""
+    with suppress(UnidentifiedImageError), Image.open(path) as image:
+        image.verify()
+    stored = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise ValueError("its pixels cannot be decoded")
+    if stored.dtype not in (np.uint16, np.float32, np.float64):
+        raise RecordingError(
+            f"{path} holds values of type {stored.dtype}, but pictures of 8 or 16 bits, or of floats, were expected."
+        )
+    pixels = np.atleast_3d(stored)
+    if pixels.dtype.kind == "f":
+        pixels = pixels.astype(np.float32)
+        wrong = ~((pixels >= 0) & (pixels < np.inf))
+        if wrong.any():
+            raise RecordingError(
+                f"{path} holds a brightness of {pixels[wrong][0]:g}, but numbers from 0 on were expected; write 0 "
+                "where it is not known."
+            )
+    if pixels.shape[2] == 4:
+        white = 65535 if pixels.dtype == np.uint16 else 1.0
+        opacity = pixels[..., 3:] / np.float32(white)
+        laid = pixels[..., :3] * opacity + white * (1 - opacity)
+        pixels = (np.rint(laid) if pixels.dtype == np.uint16 else laid).astype(pixels.dtype)
+    return np.ascontiguousarray(pixels[..., ::-1])
 
 
 def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
@@ -179,8 +229,13 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         RecordingError: The file is missing or no image.
     """
-    with reading(path, "an image"), Image.open(path) as image:
-        return image.size
+    with reading(path, "an image"):
+        try:
+            with Image.open(path) as image:
+                return image.size
+        except UnidentifiedImageError:
+            height, width, _ = _load_deep(path).shape
+            return width, height
 
 
 def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, "..."]:

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float64, Int64
 from scipy import sparse
 
 from enerf_ns.dataparsers.event_index import EventIndex
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording, Frames
 
@@ -223,7 +222,9 @@ class _Comparison:
 
     def _log_brightness(self, number: int) -> Float64[np.ndarray, " pixels"]:
         """What the pixels see in a frame; not a number where it is too dark or too bright."""
-        image = load_image(self.frames.filenames[number]).astype(float).reshape(len(self.index.offsets) - 1, -1)
+        image = self.frames.image(number)
+        image = (image if image.dtype == np.uint8 else 255 * image).astype(float)
+        image = image.reshape(len(self.index.offsets) - 1, -1)
         image = image[self.pixels.numpy()]
         pattern = self.recording.bayer_pattern
         if image.shape[1] == 1:

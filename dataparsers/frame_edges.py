@@ -8,11 +8,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from enerf_ns.dataparsers.event_index import OFF_COLOUR, ON_COLOUR
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
 
 EVENTS_OF_EDGES = 0.05
@@ -100,7 +100,10 @@ class FrameEdges:
 
     def picture(self, number: int) -> UInt8[np.ndarray, "rows columns channels"]:
         """An undistorted frame, as wide as `PICTURE_WIDTH` at most."""
-        frame = self.frames.camera.undistort(load_image(self.frames.filenames[number]))
+        return in_8_bits(self._picture(number))
+
+    def _picture(self, number: int) -> Shaped[np.ndarray, "rows columns channels"]:
+        frame = self.frames.camera.undistort(self.frames.image(number))
         return cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA).reshape(*self._size[::-1], -1)
 
     def events_at(self, time: int, plane: int) -> UInt8[np.ndarray, "rows columns 4"]:
@@ -152,8 +155,9 @@ class FrameEdges:
         return np.bincount(places[places >= 0], minlength=rows * columns).reshape(rows, columns).astype(np.float32)
 
     def _gradient(self, number: int) -> Float32[np.ndarray, "rows columns"]:
-        brightness = _smooth(np.log(self.picture(number).mean(2).astype(np.float32) + DARKEST))
-        return np.hypot(cv2.Sobel(brightness, cv2.CV_32F, 1, 0), cv2.Sobel(brightness, cv2.CV_32F, 0, 1))
+        level = 255 * brightness(self._picture(number)).mean(2)
+        logarithm = _smooth(np.log(level + DARKEST))
+        return np.hypot(cv2.Sobel(logarithm, cv2.CV_32F, 1, 0), cv2.Sobel(logarithm, cv2.CV_32F, 0, 1))
 
 
 def _smooth(picture: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:

@@ -23,10 +23,11 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import UserError, printable
 from enerf_ns.dataparsers.event_index import event_picture
-from enerf_ns.dataparsers.files import fill_page, load_image
+from enerf_ns.dataparsers.files import fill_page
 from enerf_ns.dataparsers.focus import AS_READ, AS_STATED, Hypothesis
 from enerf_ns.dataparsers.frame_bursts import FrameBursts
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import in_8_bits
 from enerf_ns.dataparsers.problems import (
     EventStatistics,
     Problem,
@@ -157,7 +158,9 @@ class Inspection:
             rows[name] = "none"
             if frames is not None:
                 depth = ", with depth" if frames.depth_filenames else ""
-                rows[name] = f"{len(frames.times):,}, {_span(frames.times[0], frames.times[-1])}{depth}"
+                rows[name] = (
+                    f"{len(frames.times):,}, {_span(frames.times[0], frames.times[-1])}{depth}{frames.white_in_words}"
+                )
         rows["event camera"] = _camera(recording.camera)
         frames = self._frames
         if frames is not None:
@@ -371,7 +374,7 @@ class Inspection:
             Instant(
                 _seconds(frames.times[i]),
                 self._events_at(frames.times[i]),
-                _picture(frames.camera.undistort(load_image(frames.filenames[i])), "JPEG"),
+                _picture(in_8_bits(frames.camera.undistort(frames.image(i))), "JPEG"),
                 frames.filenames[i].name,
             )
             for i in chosen

@@ -13,9 +13,10 @@ from rich.progress import track
 from enerf_ns.dataparsers.errors import OutputError
 from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.index_cache import cache_folder
+from enerf_ns.dataparsers.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording import Frames
 
-LAYOUT = 1
+LAYOUT = 2
 """Version of what is written, counted up when that changes."""
 
 
@@ -37,7 +38,7 @@ def write_pictures(frames: Frames) -> list[Path]:
         ) from error
     missing = [i for i, place in enumerate(places) if not _is_current(place, frames.filenames[i])]
     for i in track(missing, "Writing undistorted pictures", transient=True, disable=not missing):
-        picture, state = frames.picture(i), frames.filenames[i].stat()
+        picture, state = in_8_bits(frames.picture(i)), frames.filenames[i].stat()
         encoded = cv2.imencode(".png", picture[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
         try:
             write_whole(places[i], encoded)
@@ -53,7 +54,7 @@ def write_pictures(frames: Frames) -> list[Path]:
 def _place(frames: Frames, source: Path) -> Path:
     camera, directions = frames.camera, frames.camera.directions
     lens = [getattr(camera, field.name) for field in fields(camera) if field.name != "directions"]
-    made_from = repr((LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor)).encode()
+    made_from = repr((LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor, frames.white_level)).encode()
     table = b"" if directions is None else directions.tobytes()
     return cache_folder() / f"pictures-{hashlib.sha256(made_from + table).hexdigest()[:32]}" / f"{source.stem}.png"
 

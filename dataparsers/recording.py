@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int64, UInt8
+from jaxtyping import Bool, Float32, Int, Int64, Shaped
 from PIL import Image
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import load_array, load_image
+from enerf_ns.dataparsers.files import is_deep, load_array, load_image
+from enerf_ns.dataparsers.picture_depth import find_white_level
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
@@ -90,6 +91,10 @@ class Frames:
     """Number of each frame in its folder, from 0; counted here unless given."""
     downscale_factor: float = 1.0
     """Pixels along the squares of which each becomes one pixel of a picture, at least 1."""
+    stated_white: float | None = None
+    """The value of full brightness in files of more than 8 bits, where the recording states it."""
+    files_of_recording: tuple[Path, ...] = ()
+    """All frames of the recording, which tell that value where it is not stated; `filenames` unless given."""
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -110,25 +115,57 @@ class Frames:
         camera = self.camera.undistorted()
         return camera if self.downscale_factor == 1.0 else camera.downscaled(self.downscale_factor)
 
-    def picture(self, index: int) -> UInt8[np.ndarray, "height width channels"]:
-        """A frame as the `picture_camera` would have taken it, with one or three channels.
+    @cached_property
+    def white_level(self) -> float:
+        """The value of full brightness in files of more than 8 bits.
 
         Raises:
-            RecordingError: The file is missing or cannot be decoded.
+            RecordingError: A file of the recording is missing or cannot be decoded.
         """
-        return self.downscaled(self.camera.undistort(load_image(self.filenames[index])))
+        return self.stated_white or find_white_level(self.files_of_recording or self.filenames)
+
+    @property
+    def white_in_words(self) -> str:
+        """What is taken as full brightness, to follow other words on the frames; empty for frames of 8 bits."""
+        return f", white is {self.white_level:g}" if is_deep(self.filenames[0]) else ""
+
+    def image(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
+        """A frame as its camera took it, with one or three channels: uint8, or float32 in [0, 1] of deeper files.
+
+        Raises:
+            RecordingError: The file is missing or cannot be decoded, or holds more than what is stated to be white.
+        """
+        image = load_image(self.filenames[index])
+        if image.dtype == np.uint8:
+            return image
+        if image.max() > self.white_level:
+            raise RecordingError(
+                f"{self.filenames[index]} holds {image.max():g}, but {self.white_level:g} is stated to be white; state "
+                "the largest value that the camera writes."
+            )
+        return image / np.float32(self.white_level)
+
+    def picture(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
+        """A frame as the `picture_camera` would have taken it; of the types of `image`.
+
+        Raises:
+            RecordingError: As of `image`.
+        """
+        return self.downscaled(self.camera.undistort(self.image(index)))
 
     def downscaled(
-        self, image: UInt8[np.ndarray, "height width channels"]
-    ) -> UInt8[np.ndarray, "new_height new_width channels"]:
-        """An image of the size of the frames at that of the pictures, antialiased."""
+        self, image: Shaped[np.ndarray, "height width channels"]
+    ) -> Shaped[np.ndarray, "new_height new_width channels"]:
+        """An image of the size of the frames at that of the pictures, antialiased; uint8, or float32."""
         if self.downscale_factor == 1.0:
             return image
         camera = self.picture_camera
         right, lower = camera.width * self.downscale_factor, camera.height * self.downscale_factor
         size, box = (camera.width, camera.height), (0.0, 0.0, right, lower)
-        shown = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image)
-        return np.asarray(shown.resize(size, Image.Resampling.HAMMING, box)).reshape(camera.height, camera.width, -1)
+        parts = [image] if image.dtype == np.uint8 else np.split(image, image.shape[2], axis=2)
+        shown = [Image.fromarray(part[..., 0] if part.shape[2] == 1 else part) for part in parts]
+        small = [np.asarray(part.resize(size, Image.Resampling.HAMMING, box)) for part in shown]
+        return np.dstack(small)
 
     def depth(self, index: int) -> Float32[np.ndarray, "height width"] | None:
         """Depth along the optical axis in metres, 0 where it is unknown; of the middles of downscaled pixels.
@@ -160,6 +197,7 @@ class Frames:
             depth_filenames=depth,
             exposures=None if self.exposures is None else self.exposures[indices],
             numbers=self.numbers[indices],
+            files_of_recording=self.files_of_recording or self.filenames,
         )
 
 
@@ -229,6 +267,7 @@ class EventRecording:
             states = [(file.resolve(), file.stat()) for file in self.event_files]
             told = ((str(path), now.st_size, now.st_mtime_ns, now.st_ctime_ns) for path, now in states)
             self._set(event_file_states=tuple(told))
+        self._set_files_of_recording()
         notes, shares = [*self.notes], dict(self.shares_outside_poses)
         covered = {
             name: self._covered(getattr(self, name), what, notes, shares)
@@ -381,6 +420,15 @@ class EventRecording:
     def _set(self, **values: object) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def _set_files_of_recording(self) -> None:
+        """Has frames of all kinds take the same value for white."""
+        kinds = ("frames", "blurred_frames", "held_out_frames")
+        all_frames = {kind: frames for kind in kinds if (frames := getattr(self, kind)) is not None}
+        files = tuple(file for frames in all_frames.values() for file in frames.filenames)
+        for kind, frames in all_frames.items():
+            if not frames.files_of_recording:
+                self._set(**{kind: replace(frames, files_of_recording=files)})
 
     def _covered(self, frames: Frames | None, what: str, notes: list[str], shares: dict[str, float]) -> Frames | None:
         """The frames within the poses; says in notes and shares what was left out."""

@@ -19,7 +19,6 @@ import numpy as np
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
@@ -560,10 +559,7 @@ class _Resolver:
         channels = self.use(
             name,
             lambda: (
-                3
-                if colour_events
-                or (self.use_frames and frames is not None and is_colour(load_image(frames.filenames[0])))
-                else 1
+                3 if colour_events or (self.use_frames and frames is not None and is_colour(frames.image(0))) else 1
             ),
         )
         why = "the field learns from colour frames" if channels == 3 else "nothing here is in colour"

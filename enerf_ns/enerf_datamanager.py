@@ -25,6 +25,7 @@ from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_d
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import brightness
 from enerf_ns.dataparsers.recording import EventRecording, Frames, overlaps
 from enerf_ns.event_dataset import EventDataset
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
@@ -232,8 +233,11 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def frame_colours(self) -> Tensor:
-        """All frames that are learnt from, uint8, shape (frames, height, width, 3)."""
+        """All frames that are learnt from, shape (frames, height, width, 3): uint8, or float32 in [0, 1] where one of
+        them has more than 8 bits."""
         pictures = [self.train_dataset.get_numpy_image(i) for i in range(len(self.train_dataset))]
+        if any(picture.dtype != np.uint8 for picture in pictures):
+            pictures = [brightness(picture) for picture in pictures]
         return torch.from_numpy(np.stack(pictures)).to(self.device)
 
     @cached_property
@@ -259,7 +263,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         if "frames" in config.supervision:
             indices = self._frame_pixels(self._num_frame_pixels)
             instants = self._frame_instants(indices[:, 0])
-            colours = self.frame_colours[tuple(indices.T)].float() / 255.0
+            colours = self.frame_colours[tuple(indices.T)]
+            colours = colours.float() / 255.0 if colours.dtype == torch.uint8 else colours
             frames = FrameBatch(indices, instants, colours, self._frames_are_grey)
         return TrainBatch(events, frames)
 

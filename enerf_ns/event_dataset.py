@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 
 
@@ -25,12 +27,20 @@ class EventDataset(InputDataset):
         """Whether the pictures are frames; otherwise they show events."""
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """Picture of shape (height, width, 3), uint8."""
+        """Picture of shape (height, width, 3): uint8, or float32 in [0, 1] of frames of more than 8 bits."""
         if not self.are_frames:
             time = int(self.frames.times[image_idx])
             return self.frames.downscaled(event_picture(index_events(self.recording), self.recording.camera, time))
         image = self.frames.picture(image_idx)
         return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+
+    def get_image_float32(self, image_idx: int) -> Tensor:
+        """Picture of shape (height, width, 3) in [0, 1]."""
+        return torch.from_numpy(brightness(self.get_numpy_image(image_idx)))
+
+    def get_image_uint8(self, image_idx: int) -> Tensor:
+        """Picture of shape (height, width, 3)."""
+        return torch.from_numpy(in_8_bits(self.get_numpy_image(image_idx)))
 
     def get_metadata(self, data: dict) -> dict:
         """is_frame: whether the picture is a frame. depth, where the recording has it: metres along the optical axis

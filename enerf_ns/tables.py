@@ -36,7 +36,9 @@ def recording_table(parser: EventDataParserConfig) -> Table:
             rows[name] = "none"
             continue
         depth_note = ", with depth" if frames.depth_filenames else ""
-        rows[name] = f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}"
+        rows[name] = (
+            f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}{frames.white_in_words}"
+        )
     if depth is not None:
         _, scale, box = scene_normalisation(recording, *depth, parser.box)
         rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"

@@ -3,7 +3,7 @@
     events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
     poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
     recording.json                   camera; and, optional, frame_camera, contrast_thresholds, refractory_period_ns,
-                                     bayer_pattern, response, depth_range, reconstructed_by
+                                     bayer_pattern, response, depth_range, reconstructed_by, white_level
     camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
@@ -32,7 +32,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.camera import COEFFICIENTS, Camera, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import load_array, load_image, of_file, read_json, write_whole
+from enerf_ns.dataparsers.files import is_deep, load_array, load_image, of_file, read_json, write_whole
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
@@ -57,7 +57,7 @@ FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 
 OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
-    "reconstructed_by",
+    *("reconstructed_by", "white_level"),
 )
 EXPOSURES_NAME = "exposures_ns.txt"
 STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
@@ -94,6 +94,7 @@ def read(folder: Path) -> EventRecording:
     if reconstructed_by is not None:
         blurred_rig = camera, trajectory
         notes.append(f"The blurred frames are reconstructed from events by {reconstructed_by}.")
+    white = _parse_white_level(path, about)
     depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
     with of_file(path):
         return EventRecording(
@@ -103,8 +104,8 @@ def read(folder: Path) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _stream_events(folder / "events", columns),
             event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
-            frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, depth_files),
-            blurred_frames=_read_frames(folder / "blurred_frames", *blurred_rig),
+            frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, white, depth_files),
+            blurred_frames=_read_frames(folder / "blurred_frames", *blurred_rig, white),
             reconstructed_by=reconstructed_by,
             contrast_thresholds=_parse_two(
                 path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
@@ -141,7 +142,9 @@ def write(recording: EventRecording, folder: Path) -> int:
         raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
     sensor = recording.contrast_thresholds, recording.refractory_period, recording.bayer_pattern, recording.response
     frame_camera = frame_cameras[0] if frame_cameras else None
-    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range, recording.reconstructed_by)
+    deep = [frames for frames in kinds.values() if frames is not None and is_deep(frames.filenames[0])]
+    frames_about = recording.reconstructed_by, deep[0].white_level if deep else None
+    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range, *frames_about)
     write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
@@ -362,6 +365,7 @@ def _encode_about(
     response: str | None,
     depth_range: tuple[float, float] | None,
     reconstructed_by: str | None = None,
+    white_level: float | None = None,
 ) -> bytes:
     """recording.json, in which what is not known is left out."""
     about = {
@@ -373,6 +377,7 @@ def _encode_about(
         "response": response,
         "depth_range": depth_range,
         "reconstructed_by": reconstructed_by,
+        "white_level": white_level,
     }
     return encode_json({key: value for key, value in about.items() if value is not None})
 
@@ -400,11 +405,12 @@ def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, A
 
 
 def _read_frames(
-    folder: Path, camera: Camera, trajectory: Trajectory, depth_files: Sequence[Path] = ()
+    folder: Path, camera: Camera, trajectory: Trajectory, white: float | None, depth_files: Sequence[Path] = ()
 ) -> Frames | None:
     kinds = Image.registered_extensions()
     files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
-    return read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files, folder / EXPOSURES_NAME)
+    frames = read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files, folder / EXPOSURES_NAME)
+    return frames and replace(frames, stated_white=white)
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
@@ -440,6 +446,18 @@ def _parse_two(path: Path, about: dict, name: str, expected: str) -> tuple[float
         return None
     first, second = parse_numbers(path, name, about[name], (2,), expected).tolist()
     return first, second
+
+
+def _parse_white_level(path: Path, about: dict) -> float | None:
+    if "white_level" not in about:
+        return None
+    white = about["white_level"]
+    if type(white) not in (int, float) or not 0 < white < np.inf:
+        raise RecordingError(
+            f"{path} holds white_level = {shown(white)}, but a number above 0, that of full brightness in files of "
+            "more than 8 bits, was expected."
+        )
+    return float(white)
 
 
 def _list(names: tuple[str, ...] | list[str]) -> str:

@@ -12,8 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
-from enerf_ns.dataparsers.files import in_colour, load_image
+from enerf_ns.dataparsers.files import in_colour
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import brightness
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 from enerf_ns.evaluation.metrics import KNOWN, is_known
@@ -159,8 +160,8 @@ def _blurred_frame(recording: EventRecording, time: int) -> np.ndarray | None:
     frames = recording.blurred_frames
     if frames is None or recording.held_out_frames is not None or time not in frames.times:
         return None
-    file = frames.filenames[int(np.flatnonzero(frames.times == time)[0])]
-    return in_colour(frames.camera.undistort(load_image(file))) / 255.0
+    number = int(np.flatnonzero(frames.times == time)[0])
+    return in_colour(brightness(frames.camera.undistort(frames.image(number))))
 
 
 def _known_depth(view: HeldOutView) -> np.ndarray | None:

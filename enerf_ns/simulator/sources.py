@@ -19,6 +19,7 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import image_size, load_image
 from enerf_ns.dataparsers.formats.text_tables import read_times
+from enerf_ns.dataparsers.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.evaluation.runs import load_any_method
@@ -107,7 +108,7 @@ class Pictures(ABC):
 
     @abstractmethod
     def _load(self, index: int) -> Shaped[np.ndarray, "height width *channels"]:
-        """One picture as it is stored, uint8 or uint16, grey or R G B."""
+        """One picture, uint8 or float32 in [0, 1], grey or R G B."""
 
     def brightness(
         self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
@@ -131,8 +132,7 @@ class Pictures(ABC):
 
     def _load_linear(self, index: int) -> np.ndarray:
         picture = self._load(index)
-        levels = np.linspace(0, 1, np.iinfo(picture.dtype).max + 1)
-        return (linear_from_srgb(levels) if self.gamma else levels).astype(np.float32)[picture]
+        return linear_picture(picture) if self.gamma else brightness(picture)
 
 
 class ImageFolder(Pictures):
@@ -186,34 +186,23 @@ class ImageFolder(Pictures):
                     f"{file} has {size[0]} x {size[1]} pixels, but the first picture, {self.filenames[0].name}, has "
                     f"{self.width} x {self.height}; give pictures of one size."
                 )
-        first = self._decode(self.filenames[0])
-        self._kind = first.ndim, first.dtype
+        first = load_image(self.filenames[0])
+        self._kind = first.shape[2], first.dtype
 
     def _load(self, index: int) -> Shaped[np.ndarray, "height width *channels"]:
-        picture = self._decode(self.filenames[index])
-        if (picture.ndim, picture.dtype) != self._kind:
+        image = load_image(self.filenames[index])
+        if (image.shape[2], image.dtype) != self._kind:
             found, expected = (
-                f"{'grey' if ndim == 2 else 'in colour'} with {8 * dtype.itemsize} bits"
-                for ndim, dtype in ((picture.ndim, picture.dtype), self._kind)
+                f"{'grey' if channels == 1 else 'in colour'} with {8 * dtype.itemsize} bits"
+                for channels, dtype in ((image.shape[2], image.dtype), self._kind)
             )
             raise RecordingError(
                 f"{self.filenames[index]} is {found}, but the first picture, {self.filenames[0].name}, is {expected}; "
                 "give pictures of one kind."
             )
-        return picture
-
-    def _decode(self, file: Path) -> np.ndarray:
-        picture = load_image(file)  # which says what is wrong with a file, but gives 8 bits
-        stored = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is not None and stored.dtype == np.uint16:
-            picture = np.atleast_3d(stored)
-            if picture.shape[2] == 4:
-                opacity = picture[..., 3:] / 65535
-                picture = np.round(picture[..., :3] * opacity + 65535 * (1 - opacity)).astype(np.uint16)
-            picture = picture[..., ::-1]
-        elif stored is not None and stored.dtype != np.uint8:
-            raise RecordingError(f"{file} holds values of {stored.dtype}, but pictures of 8 or 16 bits were expected.")
-        return picture[..., 0] if picture.shape[2] == 1 else picture
+        if image.dtype != np.uint8:
+            image = image / np.float32(find_white_level(tuple(self.filenames)))
+        return image[..., 0] if image.shape[2] == 1 else image
 
 
 class Video(Pictures):
@@ -392,6 +381,13 @@ class TrainedRun:
 def linear_from_srgb(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Linear brightness in [0, 1] of sRGB values in [0, 1] (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def linear_picture(picture: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """Linear brightness of an sRGB picture, uint8 or float32 in [0, 1]."""
+    if picture.dtype == np.uint8:
+        return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[picture]
+    return linear_from_srgb(picture)
 
 
 def _pose(trajectory: Trajectory, time: int) -> np.ndarray:

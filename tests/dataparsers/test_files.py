@@ -24,10 +24,11 @@ from enerf_ns.dataparsers.files import (
 @pytest.mark.parametrize(
     ("mode", "channels"), [("L", 1), ("RGB", 3), ("RGBA", 3), ("LA", 1), ("P", 3), ("I;16", 1), ("1", 1)]
 )
-def test_load_image_gives_one_or_three_channels_of_uint8(tmp_path: Path, mode: str, channels: int):
+def test_load_image_gives_one_or_three_channels(tmp_path: Path, mode: str, channels: int):
     grey = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 256
     if mode == "I;16":
-        image = Image.fromarray((grey * 257).astype(np.uint16))
+        grey = grey * 257
+        image = Image.fromarray(grey.astype(np.uint16))
     elif mode == "1":
         grey = np.where(grey > 127, 255, 0)
         image = Image.fromarray(grey.astype(np.uint8)).convert("1")
@@ -35,7 +36,7 @@ def test_load_image_gives_one_or_three_channels_of_uint8(tmp_path: Path, mode: s
         image = Image.fromarray(grey.astype(np.uint8)).convert("RGB").convert(mode)
     image.save(tmp_path / "image.png")
     loaded = load_image(tmp_path / "image.png")
-    assert loaded.dtype == np.uint8 and loaded.shape == (HEIGHT, WIDTH, channels)
+    assert loaded.dtype == (np.uint16 if mode == "I;16" else np.uint8) and loaded.shape == (HEIGHT, WIDTH, channels)
     tolerance = 51 if mode == "P" else 0  # a palette of 216 colours is coarse
     np.testing.assert_allclose(loaded.astype(int), np.repeat(grey[..., None], channels, 2), atol=tolerance)
 

@@ -205,8 +205,8 @@ def test_numbers_of_a_small_recording(tmp_path: Path):
     assert numbers["near and far"].startswith("0.5 m and 4 m, stated")
 
 
-def two_cameras(frame_trajectory: Trajectory, trajectory: Trajectory) -> EventRecording:
-    """A recording without files, whose frames come from a camera of their own."""
+def two_cameras(frame_trajectory: Trajectory, trajectory: Trajectory, frame: Path = Path("0.png")) -> EventRecording:
+    """A recording without files but for a frame, which comes from a camera of its own."""
     generator = np.random.default_rng(0)
     number = 5000
     times = np.sort(generator.integers(0, 10**9, number))
@@ -214,7 +214,7 @@ def two_cameras(frame_trajectory: Trajectory, trajectory: Trajectory) -> EventRe
         generator.integers(0, 24, number), generator.integers(0, 18, number), times, generator.integers(0, 2, number)
     )
     camera = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
-    frames = Frames((Path("0.png"),), np.array([500_000_000]), Camera(48, 36, 40.0, 40.0, 23.5, 17.5), frame_trajectory)
+    frames = Frames((frame,), np.array([500_000_000]), Camera(48, 36, 40.0, 40.0, 23.5, 17.5), frame_trajectory)
     return EventRecording(
         Path("memory"), "test", camera, trajectory, lambda: iter([events]), (), frames=frames, depth_range=(1.0, 3.0)
     )
@@ -227,13 +227,14 @@ def path_drawn(inspection: Inspection) -> np.ndarray:
     return path.astype(float).filled(np.nan)
 
 
-def test_extrinsics_are_where_the_frame_camera_is_mounted():
+def test_extrinsics_are_where_the_frame_camera_is_mounted(tmp_path: Path):
+    Image.new("L", (48, 36)).save(tmp_path / "0.png")
     rows = poses()
     trajectory = Trajectory(np.arange(11) * 10**8, rows[:, :3], rows[:, 3:])
     mount = np.eye(4)
     mount[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.radians(7.0)]).as_matrix()
     mount[:3, 3] = [0.045, -0.012, 0.003]
-    inspection = Inspection.of(two_cameras(trajectory.of_mounted(mount), trajectory))
+    inspection = Inspection.of(two_cameras(trajectory.of_mounted(mount), trajectory, tmp_path / "0.png"))
     numbers = re.findall(r"-?[\d.]+", inspection.found()["extrinsics"])
     np.testing.assert_allclose(np.array(numbers, float), [45.0, -12.0, 3.0, 7.0], atol=0.05)
 

@@ -173,8 +173,8 @@ def damage(path: Path) -> None:
          r"frame2\.png has 7 x 18 pixels, but the first picture, frame0\.png, has 24 x 18"),
         (lambda folder: damage(folder / "frame0.png"), dict(frames_per_second=1.0), r"frame0\.png cannot be read"),
         (lambda folder: (folder / "frame1.png").write_bytes(b""), dict(frames_per_second=1.0), r"frame1\.png is empty"),
-        (lambda folder: cv2.imwrite(str(folder / "a.tif"), np.ones((HEIGHT, WIDTH), np.float32)),
-         dict(frames_per_second=1.0), r"a\.tif holds values of float32"),
+        (lambda folder: cv2.imwrite(str(folder / "a.tif"), np.full((HEIGHT, WIDTH), -1, np.float32)),
+         dict(frames_per_second=1.0), r"a\.tif holds a brightness of -1"),
     ],
 )  # fmt: skip
 def test_folders_that_are_no_pictures_are_refused(tmp_path: Path, change, settings: dict, message: str):

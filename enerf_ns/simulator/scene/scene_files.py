@@ -51,7 +51,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8
 from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -60,6 +60,7 @@ from trimesh.visual.material import PBRMaterial
 
 from enerf_ns.dataparsers.errors import RecordingError, UserError
 from enerf_ns.dataparsers.files import load_image, read_json
+from enerf_ns.dataparsers.picture_depth import find_white_level
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.scenes import (
     LIGHT,
@@ -71,7 +72,7 @@ from enerf_ns.simulator.scene.scenes import (
     doubled_areas,
     texture_coordinates,
 )
-from enerf_ns.simulator.sources import linear_from_srgb
+from enerf_ns.simulator.sources import linear_from_srgb, linear_picture
 from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 
 LARGEST_TEXTURE = 2048
@@ -383,12 +384,12 @@ def _one_or_three(colours: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "
 
 
 def linear_image(
-    pixels: UInt8[np.ndarray, "height width channels"], largest: int = LARGEST_TEXTURE
+    picture: Shaped[np.ndarray, "height width channels"], largest: int = LARGEST_TEXTURE
 ) -> Float32[np.ndarray, "size size channels"]:
-    """Linear brightness of an sRGB image, stretched to the next power of two above its longer side, or to `largest`."""
-    table = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
-    size = min(largest, 1 << (max(pixels.shape[:2]) - 1).bit_length())
-    return textures.square(table[_one_or_three(pixels)], size)
+    """Linear brightness of an sRGB picture, uint8 or float32 in [0, 1], stretched to the next power of two above its
+    longer side, or to `largest`."""
+    size = min(largest, 1 << (max(picture.shape[:2]) - 1).bit_length())
+    return textures.square(linear_picture(_one_or_three(picture)), size)
 
 
 def _with_area(piece: Piece) -> Piece:
@@ -507,6 +508,12 @@ def _shape(shape: str, size: np.ndarray) -> Piece:
     )
 
 
+def _picture_of(file: Path) -> Shaped[np.ndarray, "height width channels"]:
+    """An image file as uint8, or as float32 in [0, 1] of more than 8 bits."""
+    image = load_image(file)
+    return image if image.dtype == np.uint8 else image / np.float32(find_white_level((file,)))
+
+
 class _Library:
     """The textures of a scene file; each is made once.
 
@@ -535,7 +542,7 @@ class _Library:
             )
         known = textures.PROCEDURAL.get(name)
         if name not in self.levels:
-            levels = linear_image(load_image(self.folder / name)) if known is None else known.make(self.rng)
+            levels = linear_image(_picture_of(self.folder / name)) if known is None else known.make(self.rng)
             self.levels[name] = levels.reshape(*levels.shape[:2], -1)
         usual = (0.0, 1.0) if known is None else known.brightness
         dark, bright = usual if brightness is None else brightness.tolist()
