@@ -44,9 +44,13 @@ def cache_folder() -> Path:
     """
     if "ENERF_CACHE" in os.environ:
         return expanded(os.environ["ENERF_CACHE"])
-    folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
+    unknown = FileNotFoundError(errno.ENOENT, "no home folder is known", "~")
+    try:
+        folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
+    except RuntimeError as error:  # of platformdirs from 4.9 on; before, the folder is one named ~
+        raise unknown from error
     if not folder.is_absolute():
-        raise FileNotFoundError(errno.ENOENT, "no home folder is known", str(folder))
+        raise unknown
     return folder
 
 

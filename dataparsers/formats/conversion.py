@@ -136,11 +136,11 @@ def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
 @contextmanager
 def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
     """A folder to write into that becomes the output at the end of the block, if nothing fails there."""
+    check_outside_recordings("--output-dir", output_dir, source)
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
         )
-    check_outside_recordings("--output-dir", output_dir, source)
     partial = partial_of(output_dir)
     try:
         partial.mkdir(parents=True)
