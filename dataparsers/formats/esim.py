@@ -28,14 +28,20 @@ from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
 from enerf_ns.dataparsers.formats.text_tables import read_poses
-from enerf_ns.dataparsers.formats.writer import EventFiles, GrowingArray, Writer, encode_npy, encode_poses, poses_at
+from enerf_ns.dataparsers.formats.writer import (
+    FEWEST_FRAMES,
+    FEWEST_POSES,
+    EventFiles,
+    GrowingArray,
+    Writer,
+    encode_npy,
+    encode_poses,
+    poses_at,
+)
 from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
-
-FEWEST_POSES = 101
-"""Fewest poses that the reference code of E-NeRF accepts."""
 
 
 def read(folder: Path) -> EventRecording:
@@ -179,7 +185,8 @@ class EsimWriter(Writer):
     layout = "esim"
     frame_folders = ("images", "images_corrupted")
     stamps_name = "image_stamps_ns.txt"
-    fewest_frames = 11
+    fewest_frames = FEWEST_FRAMES
+    fills_up_poses = True
 
     def _check(self) -> None:
         setup, camera = self.setup, self.setup.event_camera

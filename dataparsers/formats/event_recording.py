@@ -468,6 +468,7 @@ class EventRecordingWriter(Writer):
     """Writer of this project's own layout."""
 
     layout = "event_recording"
+    is_of_reference = False
     frame_folders = ("frames", "blurred_frames")
     stamps_name = "stamps_ns.txt"
 

@@ -534,7 +534,7 @@ class TumVieWriter(Writer):
         return Hdf5EventsFile(path, "events/", dict(hdf5plugin.Blosc("zstd")), self._to_us, self.events_held)
 
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
-        path = f"{self._data}/left_images/{self._name(number)}.png"
+        path = f"{self._data}/left_images/{self._name(number)}.jpg"
         if blurred is None:
             return {path: sharp}
         return {path: blurred, f"sharp_images/{self._name(number)}.png": sharp}

@@ -9,7 +9,7 @@ Beside what a layout has, in all of them, with files named by the numbers of the
                         the numbers of events and frames are not final, if the simulation was broken off
     thresholds.npy      float32 [2, height, width], on and off threshold of each pixel of the event camera, if they vary
     depth/              .npy, float32 [height, width], z-depth in metres of each frame, 0 where nothing was hit
-    sharp_images/       in eds and tum_vie, whose own frames are blurred as those of a real camera
+    sharp_images/       .png, in eds and tum_vie, whose own frames are blurred as those of a real camera
     hdr/, hdr_blurred/  .npy, float32 linear brightness of frames, R G B if in colour, and .exr where OpenCV writes that
                         (it does with OPENCV_IO_ENABLE_OPENEXR=1 in the environment)
 """
@@ -40,6 +40,12 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 
 CAMERA_KEYS = ("width", "height", "model", "fx", "fy", "cx", "cy")
 MOUNTING_KEY = "event_camera_from_frame_camera"
+
+FEWEST_FRAMES, FEWEST_POSES = 11, 101
+"""Fewest frames and poses that the reference code of E-NeRF accepts."""
+
+LARGEST_SMALL_SIDE, LARGEST_SMALL_CENTRE = 200, 100
+"""Width or height, and place of the principal point, in pixels, that it does not accept yet."""
 
 Rig = tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]
 """Cameras of events and of frames, and the pose of the latter in the axes of the former."""
@@ -91,6 +97,10 @@ class Writer(ABC):
     """What the clock of the layout shows (ns) when the simulation's is at 0."""
     fewest_frames: ClassVar[int] = 1
     """Fewest frames that others who read this layout accept."""
+    fills_up_poses: ClassVar[bool] = False
+    """Whether poses are added where there are fewer than `FEWEST_POSES`."""
+    is_of_reference: ClassVar[bool] = True
+    """Whether the reference code of E-NeRF reads this layout."""
     poses_per_second: ClassVar[int | None] = None
     """Poses a second, as many as the data set has, where it has a fixed number."""
     published_rig: ClassVar[Rig | None] = None
@@ -132,6 +142,8 @@ class Writer(ABC):
                 np.save(folder / "thresholds.npy", setup.pixel_thresholds.astype(np.float32))
             self._write_summary(finished=False)
             self._event_files = self._open_events()
+        if self.is_of_reference and (reasons := self._reasons_against_reference()):
+            self.notes.append(f"The reference code of E-NeRF does not read this recording: {'; '.join(reasons)}.")
 
     @property
     def depth_range(self) -> tuple[float, float] | None:
@@ -174,7 +186,9 @@ class Writer(ABC):
         assert number == self.num_frames and time == self.setup.frame_times[number]
         assert (blurred is None) == (self.setup.exposure == 0)
         name = self._name(number)
-        files = {path: _encode(".png", image) for path, image in self._images(number, sharp, blurred).items()}
+        files = {
+            path: _encode(Path(path).suffix, image) for path, image in self._images(number, sharp, blurred).items()
+        }
         for folder, brightness in zip(("hdr", "hdr_blurred"), linear or (), strict=False):
             if brightness is not None:
                 files |= self._encode_hdr(f"{folder}/{name}", brightness)
@@ -231,6 +245,22 @@ class Writer(ABC):
     def _name(self, number: int) -> str:
         """Name of a frame's files, such that they sort as their numbers do."""
         return f"{number:0{max(5, len(str(len(self.setup.frame_times) - 1)))}d}"
+
+    def _reasons_against_reference(self) -> list[str]:
+        """What the reference code of E-NeRF asserts and does not find."""
+        setup, camera, reasons = self.setup, self.setup.event_camera, []
+        num_frames, num_poses = len(setup.frame_times), len(setup.trajectory.times) if setup.trajectory else 0
+        if num_frames < FEWEST_FRAMES:
+            reasons.append(f"it wants {FEWEST_FRAMES} frames or more, and there are {num_frames}")
+        if num_poses < FEWEST_POSES and not (self.fills_up_poses and num_poses):
+            reasons.append(f"it wants {FEWEST_POSES} poses or more, and there are {num_poses}")
+        if min(camera.width, camera.height) <= LARGEST_SMALL_SIDE or min(camera.cx, camera.cy) <= LARGEST_SMALL_CENTRE:
+            reasons.append(
+                f"it wants more than {LARGEST_SMALL_SIDE} pixels along both sides and a centre beyond "
+                f"{LARGEST_SMALL_CENTRE}, and there are {camera.width} x {camera.height} with the centre at "
+                f"({camera.cx:g}, {camera.cy:g})"
+            )
+        return reasons
 
     def _check_size(self, size: tuple[int, int]) -> None:
         camera = self.setup.event_camera
@@ -411,7 +441,8 @@ def _exr_enabled() -> bool:
 
 
 def _encode(kind: str, image: np.ndarray) -> bytes:
-    """Content of an image file; OpenCV keeps colours as B G R."""
-    done, content = cv2.imencode(kind, image[..., ::-1] if image.ndim == 3 else image)
+    """Content of an image file, of JPEG the best that there is; OpenCV keeps colours as B G R."""
+    best = (cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+    done, content = cv2.imencode(kind, image[..., ::-1] if image.ndim == 3 else image, best if kind == ".jpg" else ())
     assert done
     return content.tobytes()

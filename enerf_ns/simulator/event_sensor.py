@@ -73,7 +73,8 @@ class SensorSettings:
     leak_rate: float = 0.0
     """On events per second of a pixel that sees nothing change; its memory falls by this times its on threshold."""
     shot_noise_rate: float = 0.0
-    """Noise events per second and pixel in the dark; falls linearly to a quarter at brightness 1 and above."""
+    """Noise events per second and pixel; at brightness b, 1 - 0.75 (255 b + 20) / 275 of that: 0.95 in the dark, and a
+    quarter at brightness 1 and above."""
     hot_pixels: float = 0.0
     """Share of the pixels that are hot: instead of shot noise they have noise of the hot pixel rate."""
     hot_pixel_rate: float = 1000.0
@@ -136,7 +137,7 @@ class _Pixels(NamedTuple):
     leak: np.ndarray
     """By how much leak raises each pixel's level, per nanosecond."""
     noise_rate: np.ndarray
-    """Noise events of each pixel per nanosecond, at brightness 0."""
+    """Noise events of each pixel per nanosecond, of which brightness keeps a share."""
     hot: np.ndarray
     signal: np.ndarray
     """Signal of each pixel at the time of the last picture, without leak."""
@@ -371,7 +372,7 @@ def _fire(  # pragma: no cover
                 if noise > duration:
                     break
                 here = _brightness(x0 + (x1 - x0) * (noise / duration), offset)
-                chance = 1.0 if pixels.hot[i] else 1 - 0.75 * min(here, 1.0)
+                chance = 1.0 if pixels.hot[i] else 1 - 0.75 * (255 * min(here, 1.0) + 20) / 275
                 draw = _random(keys[1], i, pixels.num_noise[i])
                 if awake <= noise and _uniform(draw) <= chance:
                     fired = 1 if draw & np.uint64(1) else -1
