@@ -23,6 +23,7 @@ from platformdirs import user_cache_path
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.event_survey import EventStream, Survey, sorted_bands
 from enerf_ns.dataparsers.files import expanded, partial_of
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 
 LAYOUT = 3
 """Version of what is stored in an entry, counted up when that changes."""
@@ -41,9 +42,12 @@ def cache_folder() -> Path:
 
     Raises:
         OSError: The user has no home folder.
+        OutputError: $ENERF_CACHE lies within a recording.
     """
     if "ENERF_CACHE" in os.environ:
-        return expanded(os.environ["ENERF_CACHE"])
+        folder = expanded(os.environ["ENERF_CACHE"])
+        check_outside_recordings("ENERF_CACHE", folder)
+        return folder
     unknown = FileNotFoundError(errno.ENOENT, "no home folder is known", "~")
     try:
         folder = user_cache_path("enerf-ns", appauthor=False) / "indices"

@@ -13,7 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -208,7 +208,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., str]]:
     """Calls a command in this process, in its own folder of the test; the sentence that it ends with."""
 
     def call(*arguments: object, main: Callable[[], object] = entrypoint) -> str:
@@ -517,6 +517,13 @@ def test_without_a_home_folder_the_cache_is_done_without(where: str | None, home
     assert ended.returncode == 0, ended.stderr
     assert "could not be stored in the cache" in ended.stdout and ended.stdout.count("\n") == 1
     assert {path.name for path in home.rglob("*")}.isdisjoint({"~", "indices", ".cache"})
+
+
+def test_nor_is_the_cache(home: Path, refused, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ENERF_CACHE", "recording/cache")
+    before = tree(home)
+    assert "ENERF_CACHE" in refused("inspect", "recording")
+    assert tree(home) == before
 
 
 def test_the_corpus_is_large():

@@ -93,7 +93,7 @@ def test_a_mistake_ends_it_with_one_sentence(
     ("error", "code"),
     [
         (KeyboardInterrupt(), 130),
-        (MemoryError(), "enerf: There is not enough memory for this; ask for less at a time."),
+        (MemoryError(), "enerf: There is not enough memory for enerf demo; ask for less at a time."),
     ],
 )
 def test_what_stops_it_from_outside_is_told(error: BaseException, code: object, monkeypatch: pytest.MonkeyPatch):

@@ -157,3 +157,13 @@ def test_slider_depth_corners_move_with_the_poses(slider: EventRecording):
     assert stated.mean() > 0.9
     assert depth[stated].max() > 2 * depth[stated].min()
     assert np.median(np.abs(motion[:, 1])) < 0.02 * np.median(np.abs(motion[:, 0]))
+
+
+def test_a_byte_order_mark_is_passed_over_in_each_text(tmp_path: Path):
+    marked, plain = write_davis(tmp_path / "marked"), write_davis(tmp_path / "plain")
+    for file in marked.glob("*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    events, expected = (joined(read_recording(folder).stream_events()) for folder in (marked, plain))
+    np.testing.assert_array_equal(
+        [events.x, events.y, events.t, events.p], [expected.x, expected.y, expected.t, expected.p]
+    )

@@ -360,6 +360,10 @@ def frame_camera(**changes: object) -> dict:
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 
 BAD_ABOUT: dict[str, tuple[dict, str]] = {
+    "a sensor of 4 gigapixels": (
+        camera(width=65535, height=65535, fx=3e4, fy=3e4, cx=3e4, cy=3e4),
+        "camera, holds a camera of 65535 x 65535 pixels, but at most 67,108,864 were expected",
+    ),
     "no focal length": (camera(fx=None, fy=None), "recording.json lacks fx and fy in camera"),
     "key misspelt": (camera(distorsion=[1]), "recording.json holds the unknown key 'distorsion' in camera"),
     "other key misspelt": ({"contrast_threshold": 1}, "holds the unknown key 'contrast_threshold'; known are camera,"),
@@ -443,6 +447,13 @@ def test_bad_recording_json(tmp_path: Path, about: dict, message: str):
     refused(write_recording(tmp_path / "own", ("frames",), **about), message)
 
 
+def one_pixel() -> dict[str, np.ndarray]:
+    """600 events within the poses, all at (3, 4)."""
+    number = np.arange(600)
+    x, y, p = (np.full(600, value) for value in (3, 4, 1))
+    return {"x": x.astype(np.uint16), "y": y.astype(np.uint16), "t": 10**8 + number * 10**6, "p": p.astype(np.int8)}
+
+
 def save(name: str, array: np.ndarray) -> Callable[[Path], object]:
     return lambda folder: np.save(folder / name, array)
 
@@ -460,6 +471,14 @@ def remove(name: str) -> Callable[[Path], object]:
 
 
 BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "t of -2^63": (
+        save("events/t.npy", np.array([-(2**63), *EVENTS[1:, 2]])),
+        "t.npy holds the time -9223372036854775808 ns, which is beyond 146 years",
+    ),
+    "all events of a hot pixel": (
+        lambda folder: [save(f"events/{name}.npy", column)(folder) for name, column in one_pixel().items()],
+        "holds 600 events, of which 600 are of 1 hot pixel, with over 10 times as many as around",
+    ),
     "x missing": (remove("events/x.npy"), "events/x.npy is missing"),
     "p missing": (remove("events/p.npy"), "events/p.npy is missing"),
     "t empty": (put("events/t.npy", b""), "events/t.npy is empty"),
