@@ -83,6 +83,20 @@ def check_is_file(path: Path, expected: str) -> None:
         raise RecordingError(f"{path} is {what}; {expected} was expected there.")
 
 
+def check_is_folder(path: Path, expected: str) -> None:
+    """Says so where something is there that is no folder, in which nothing would be found.
+
+    Args:
+        path: Links are followed.
+        expected: What is expected there, such as "a folder of frames".
+
+    Raises:
+        RecordingError: A file of any kind.
+    """
+    if path.exists() and not path.is_dir():
+        raise RecordingError(f"{path} is no folder, but {expected} was expected there; rename it, or give its content.")
+
+
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
     """Turns whatever a library raises at a damaged file into one sentence about it.

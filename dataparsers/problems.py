@@ -73,6 +73,13 @@ MIN_EVENTS_PER_PIXEL = 10
 """Fewest events of a pixel on average: a few grey levels' worth of change; recordings that the method was shown on have
 dozens."""
 
+MIN_SHARE_AT_CUT = 0.2
+"""Events in the last two columns (or rows) up to 255, as a share of the median column, from which it is a cut and not
+the border of the scene that they end at."""
+
+FLOAT_TIMES, FEWEST_FLOAT_TIMES = 2**16, 100
+"""Times of events that are compared with numbers of single precision, and how many of them must be different ones."""
+
 MAX_SHARE_HOT = 0.001
 """Largest share of pixels that are hot; a healthy sensor has a handful."""
 
@@ -189,6 +196,8 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
         *_distance_problems(recording, statistics, depth_range),
         *_rate_problems(silences, bursts, flag),
         *_count_problems(statistics),
+        *_cut_coordinates(statistics),
+        *_coarse_times(recording),
         *_frame_problems(recording.frames or recording.blurred_frames),
     ]
 
@@ -378,6 +387,36 @@ def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
             f"The sensor has {_count(hot, 'hot pixel')} ({percent(hot / statistics.counts.size)}), left out here.",
             "If they lie on bright points of the scene, keep them with --keep-hot-pixels True; else raise the sensor's "
             "thresholds, let it cool, or mask them in its settings.",
+        )
+
+
+def _cut_coordinates(statistics: EventStatistics) -> Iterator[Problem]:
+    """Coordinates of which 8 bits were kept: events end at 255, and not because nothing was to be seen there."""
+    for name, axis in (("x", 0), ("y", 1)):
+        counts = statistics.counts.sum(axis)
+        seen, beyond = counts[:256], counts[256:]
+        if len(beyond) and not beyond.any() and seen[-2:].mean() > MIN_SHARE_AT_CUT * np.median(seen):
+            yield Problem(
+                f"No event has {name} above 255, though the sensor has {len(counts)} pixels along it, and as many "
+                f"events have {name} = 255 as other values: {name} seems to be cut to 8 bits.",
+                f"Write {name} in 16 bits (numpy.uint16), anew from the source of the events.",
+            )
+
+
+def _coarse_times(recording: EventRecording) -> Iterator[Problem]:
+    """Times that went through float32, of which 24 bits are left: all of them are multiples of its spacing."""
+    index = index_events(recording)
+    times = np.unique(index.times[:: -(-len(index) // FLOAT_TIMES)].numpy())
+    times = times[np.abs(times) >= 2**24]
+    if len(times) < FEWEST_FLOAT_TIMES or (times.astype(np.float32).astype(np.int64) != times).any():
+        return
+    unit = int(np.gcd.reduce(times))
+    binary, spacing = unit & -unit, int(np.spacing(np.float32(np.abs(times).max())))
+    if unit == binary or binary < spacing:  # and not because they are whole microseconds, say
+        yield Problem(
+            f"The times of the events are numbers of single precision (float32), which at {times[-1] * 1e-9:.3g} s "
+            f"tell {spacing:,} ns apart and no less.",
+            "Write them as int64, or in double precision (float64), anew from their source.",
         )
 
 

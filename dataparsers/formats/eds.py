@@ -34,7 +34,11 @@ from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
+<<<<<<< HEAD
 from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json, read_text
+=======
+from enerf_ns.dataparsers.files import check_image_size, check_is_file, check_is_folder, in_colour, of_file, read_json
+>>>>>>> 08ab133 (What was accepted in silence is named: files for folders, event files that lack, float32 times, coordinates cut to 8 bits)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.json_values import parse_array
@@ -196,6 +200,8 @@ def _read_image_list(
 ) -> tuple[tuple[Path, ...], Int64[np.ndarray, " images"]]:
     """The images that are used, and their stamps on the clock of the events."""
     folders = [folder / RAW_IMAGES, folder / PREPARED_IMAGES]
+    for path in folders:
+        check_is_folder(path, "a folder of frames")
     folders = [path for path in (reversed(folders) if prepared else folders) if path.is_dir()]
     images = [tuple(sorted(path.glob("*.png")) or sorted(path.glob("*.jpg"))) for path in folders]
     files: tuple[Path, ...] = next(filter(None, images), ())

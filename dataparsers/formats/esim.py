@@ -23,7 +23,7 @@ import torch
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import in_colour, load_array, of_file, read_json
+from enerf_ns.dataparsers.files import check_is_folder, in_colour, load_array, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
@@ -62,6 +62,7 @@ def read(folder: Path) -> EventRecording:
     event_files = sorted((folder / "events").glob("*.npy"))
     if not event_files:
         raise RecordingError(f"{folder / 'events'} holds no .npy files; files of events (x y t_ns p) were expected.")
+    _check_numbers(event_files)
     trajectory = Trajectory(*read_poses(poses_files[0], "ns", notes))
     camera, depth_range = _read_poses_bounds(folder / "poses_bounds.npy")
     simulation_file = folder / "simulation.json"
@@ -94,6 +95,22 @@ def read(folder: Path) -> EventRecording:
             locate_event=lambda index: _locate(event_files, num_rows, index),
             num_events=sum(num_rows),
         )
+
+
+def _check_numbers(files: list[Path]) -> None:
+    """Where the names of event files count on by one, none is missing between the first and the last."""
+    if not all(file.stem.isdecimal() for file in files):
+        return
+    files = sorted(files, key=lambda file: int(file.stem))
+    steps = np.diff([int(file.stem) for file in files])
+    gaps = np.flatnonzero(steps > 1)
+    if not len(gaps) or 2 * (steps == 1).sum() < len(steps):  # else they do not count on: stamps, or every tenth
+        return
+    before, after, missing = files[gaps[0]], files[gaps[0] + 1], int((steps[gaps] - 1).sum())
+    raise RecordingError(
+        f"{before.parent} holds {before.name} and then {after.name}, while the names of its {len(files)} files count "
+        f"on by one: {missing} {'is' if missing == 1 else 'are'} missing; copy the events that lack from their source."
+    )
 
 
 def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
@@ -130,6 +147,7 @@ def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
 
 def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, exposure: int | None) -> Frames | None:
     files = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
+    check_is_folder(folder.parent / "depth", "a folder of depth maps")
     depth_files = sorted((folder.parent / "depth").glob("*.npy"))
     frames = read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
     return frames and frames.with_exposure(exposure)

@@ -9,7 +9,7 @@ import numpy as np
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, load_array, of_file
+from enerf_ns.dataparsers.files import check_image_size, check_is_folder, load_array, of_file
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows, read_times
 from enerf_ns.dataparsers.recording import LONGEST_EXPOSURE, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -40,6 +40,7 @@ def read_frames(
         RecordingError: There are not as many stamps, exposures or depth maps as images, or one of them cannot be read,
             is of another size than the camera's, or is no exposure that a frame can have.
     """
+    check_is_folder(stamps_file.parent, "a folder of frames")
     if not files and not stamps_file.exists():
         return None
     times = read_times(stamps_file, "ns")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera, check_rotation
 from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import image_size, of_file, read_json
+from enerf_ns.dataparsers.files import check_is_folder, image_size, of_file, read_json
 from enerf_ns.dataparsers.formats.json_values import parse_array
 from enerf_ns.dataparsers.formats.text_tables import FARTHEST, QUATERNION_TOLERANCE
 from enerf_ns.dataparsers.recording import Frames
@@ -173,6 +173,7 @@ def read_views(folder: Path, notes: list[str]) -> Frames | None:
     Raises:
         RecordingError: Anything in the list of views cannot be used, or an image is missing or of another size.
     """
+    check_is_folder(folder / "views", "a folder of views")
     views = next((views for views in (folder / "views", folder.parent / "views") if views.is_dir()), None)
     if views is None:
         return None

@@ -47,7 +47,7 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import image_size, of_file, read_json
+from enerf_ns.dataparsers.files import check_is_folder, image_size, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.text_tables import (
@@ -215,6 +215,7 @@ def _read_frames(
 ]:
     """Files, stamps, the middles of the exposures (ns on the clock of the data set, over at most `longest`), and how
     long those are (ns), where that is known."""
+    check_is_folder(folder, "a folder of frames")
     files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
     stamps_file = _here_or_above(folder, f"image_timestamps_{side}.txt")
     if not files and not stamps_file.exists():
