@@ -34,11 +34,15 @@ from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-<<<<<<< HEAD
-from enerf_ns.dataparsers.files import check_image_size, in_colour, of_file, read_json, read_text
-=======
-from enerf_ns.dataparsers.files import check_image_size, check_is_file, check_is_folder, in_colour, of_file, read_json
->>>>>>> 08ab133 (What was accepted in silence is named: files for folders, event files that lack, float32 times, coordinates cut to 8 bits)
+from enerf_ns.dataparsers.files import (
+    check_image_size,
+    check_is_file,
+    check_is_folder,
+    in_colour,
+    of_file,
+    read_json,
+    read_text,
+)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.json_values import parse_array

@@ -32,11 +32,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.camera import COEFFICIENTS, Camera, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
-<<<<<<< HEAD
-from enerf_ns.dataparsers.files import is_deep, load_array, load_image, of_file, read_json, write_whole
-=======
-from enerf_ns.dataparsers.files import check_is_folder, is_deep, load_array, of_file, read_json, write_whole
->>>>>>> 08ab133 (What was accepted in silence is named: files for folders, event files that lack, float32 times, coordinates cut to 8 bits)
+from enerf_ns.dataparsers.files import (
+    check_is_folder,
+    is_deep,
+    load_array,
+    load_image,
+    of_file,
+    read_json,
+    write_whole,
+)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
