@@ -36,7 +36,6 @@ from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import (
     check_image_size,
-    check_is_file,
     check_is_folder,
     in_colour,
     of_file,
