@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 from platformdirs import user_cache_path
+
+from enerf_ns.dataparsers.files import partial_of
 
 
 def make_ffmpeg_available() -> None:
@@ -32,11 +33,13 @@ def _link_ffmpeg_into(folder: Path) -> None:
     from imageio_ffmpeg import get_ffmpeg_exe
 
     folder.mkdir(parents=True, exist_ok=True)
-    name = "ffmpeg.exe" if sys.platform == "win32" else "ffmpeg"
-    with tempfile.TemporaryDirectory(dir=folder) as temporary:
-        link = Path(temporary) / name
+    program = folder / ("ffmpeg.exe" if sys.platform == "win32" else "ffmpeg")
+    partial = partial_of(program)
+    try:
         if sys.platform == "win32":
-            shutil.copyfile(get_ffmpeg_exe(), link)
+            shutil.copyfile(get_ffmpeg_exe(), partial)
         else:
-            link.symlink_to(get_ffmpeg_exe())
-        os.replace(link, folder / name)  # atomic: another process sees the old program or the new one
+            partial.symlink_to(get_ffmpeg_exe())
+        partial.replace(program)  # atomic: another process sees the old program or the new one
+    finally:
+        partial.unlink(missing_ok=True)

@@ -303,16 +303,26 @@ def partial_of(path: Path) -> Path:
     Args:
         path: Of a file or folder; the name of the partial has the same suffix.
     """
-    mark = f".partial-{platform.node()}-"
+    remove_leftovers(path.parent)
+    return path.with_name(f".{path.stem}{_mark()}{os.getpid()}{path.suffix}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes from a folder the partials (`partial_of`) of processes of this machine that are gone."""
+    mark = _mark()
     with suppress(OSError):  # no folder yet, or none that may be looked into
-        for entry in os.scandir(path.parent):
+        for entry in os.scandir(folder):
             number = entry.name.rpartition(mark)[2].partition(".")[0] if entry.name.startswith(".") else ""
             if mark in entry.name and number.isdecimal() and not psutil.pid_exists(int(number)):
                 if entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
                 else:
                     os.unlink(entry.path)
-    return path.with_name(f".{path.stem}{mark}{os.getpid()}{path.suffix}")
+
+
+def _mark() -> str:
+    """What the names of partials hold before the number of their process."""
+    return f".partial-{platform.node()}-"
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
@@ -332,7 +342,7 @@ def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] 
     """Writes files and appends lines to tables, all or, if anything fails, none.
 
     Args:
-        folder: That the paths begin at.
+        folder: That the paths begin at, and in which the partials lie.
         files: What each file shall hold, by path; one that is there already is replaced.
         lines: What is appended to each table of text, by path.
 
@@ -341,12 +351,12 @@ def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] 
             several files that are replaced some may be the new ones.
     """
     lines = lines or {}
-    partials = {path: (folder / path).with_name(f".{Path(path).name}.partial-{os.getpid()}") for path in files}
+    partials = {path: partial_of(folder / path.replace("/", "-")) for path in files}
     replaced = [path for path in files if (folder / path).exists()]
     lengths = {path: (folder / path).stat().st_size for path in lines if (folder / path).exists()}
     try:
         for path, content in files.items():
-            partials[path].parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
             partials[path].write_bytes(content)
         for path, line in lines.items():
             with open(folder / path, "ab", buffering=0) as table:

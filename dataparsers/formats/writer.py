@@ -139,7 +139,7 @@ class Writer(ABC):
             if setup.trajectory is not None:
                 self._write_poses(setup.trajectory)
             if setup.pixel_thresholds is not None:
-                np.save(folder / "thresholds.npy", setup.pixel_thresholds.astype(np.float32))
+                self._replace("thresholds.npy", encode_npy(setup.pixel_thresholds))
             self._write_summary(finished=False)
             self._event_files = self._open_events()
         if self.is_of_reference and (reasons := self._reasons_against_reference()):

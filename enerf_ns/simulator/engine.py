@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import absolute
+from enerf_ns.dataparsers.files import absolute, remove_leftovers
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, open_writer, writer_of
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording import Events
@@ -70,6 +70,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
     """
     output_dir = absolute(output_dir)
     check_outside_recordings("--output-dir", output_dir, *settings.reads)
+    remove_leftovers(output_dir)
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."

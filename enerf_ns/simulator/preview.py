@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.files import in_colour
+from enerf_ns.dataparsers.files import in_colour, partial_of
 from enerf_ns.dataparsers.recording import Events
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
@@ -24,13 +24,14 @@ class Preview:
     as the frames.
 
     Args:
-        path: New .mp4 file.
+        path: New .mp4 file, which is there once the block ends, and whole.
         width, height: Of the event camera, pixels.
         frames_per_second: At which the video plays.
     """
 
     def __init__(self, path: Path, width: int, height: int, frames_per_second: int = 10):
         self.path, self.frames_per_second = path, frames_per_second
+        self._partial = partial_of(path)
         self._events = np.full((height, width, 3), NO_COLOUR, np.uint8)
         self._inverse_depths: tuple[float, float] | None = None
         self._video = None
@@ -77,15 +78,20 @@ class Preview:
         """Finishes the video."""
         if self._video is None:
             return
-        self._video.close()
-        if kind is None and not cv2.VideoCapture(str(self.path)).isOpened():
-            raise self._failure()
+        try:
+            self._video.close()
+            if cv2.VideoCapture(str(self._partial)).isOpened():
+                self._partial.replace(self.path)
+            elif kind is None:
+                raise self._failure()
+        finally:
+            self._partial.unlink(missing_ok=True)
 
     def _open(self, width: int, height: int):
         from imageio_ffmpeg import write_frames
 
         video = write_frames(
-            str(self.path),
+            str(self._partial),
             (width, height),
             fps=self.frames_per_second,
             codec="libx264",

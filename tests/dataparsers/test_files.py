@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from enerf_ns.dataparsers.files import (
     load_array,
     load_image,
     of_file,
+    partial_of,
     read_json,
     reading,
     write_together,
@@ -161,3 +165,20 @@ def test_of_files_written_together_none_is_left_where_one_fails(
     with pytest.raises(OSError, match="full"):
         write_together(tmp_path, {"a/2.png": b"2", "b/2.png": b"2"}, {"a/stamps.txt": "2\n", "b/stamps.txt": "2\n"})
     assert contents(tmp_path) == before
+
+
+def test_what_processes_that_are_gone_have_left_is_removed_by_the_next_that_writes(tmp_path: Path):
+    """Of files written together, into whichever folders; what another process is still writing stays."""
+    code = (
+        "import os, sys; from pathlib import Path; from enerf_ns.dataparsers.files import write_together;"
+        "Path.replace = lambda *_: os._exit(9);"
+        "write_together(Path(sys.argv[1]), {'a/1.png': b'1', 'b/1.png': b'2', '3.json': b'3'})"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path)]).returncode == 9
+    left = [path.name for path in tmp_path.iterdir() if path.is_file()]
+    assert len(left) == 3 and all(name.startswith(".") for name in left)
+    assert not [path for path in tmp_path.rglob("*/*")], "all in the folder that the next looks into"
+    alive = partial_of(tmp_path / "alive").name.replace(f"-{os.getpid()}", f"-{os.getppid()}")
+    (tmp_path / alive).write_text("still being written")
+    write_together(tmp_path, {"a/2.png": b"4"})
+    assert contents(tmp_path) == {"a/2.png": b"4", alive: b"still being written"}
