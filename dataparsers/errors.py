@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +37,7 @@ def exit_with_a_sentence() -> Iterator[None]:
     Raises:
         SystemExit: In place of a `UserError`, of an OSError by which the system refuses a file or a folder, and of an
             error about a name that cannot be written as text. Its sentence is on one line, whatever a name in it holds.
+            In place of a KeyboardInterrupt, with code 130.
     """
     try:
         yield
@@ -51,6 +53,9 @@ def exit_with_a_sentence() -> Iterator[None]:
         found = error.object[max(0, error.start - 40) : error.end + 40]
         sentence = f"A name holds bytes that are not UTF-8, near {found}; rename it."
         raise SystemExit(f"enerf: {printable(sentence)}") from error
+    except KeyboardInterrupt as error:
+        print("enerf: Stopped.", file=sys.stderr)
+        raise SystemExit(130) from error
 
 
 def quoted(path: Path) -> str:

@@ -1,4 +1,5 @@
-"""Checkpoints that are whole or not there, and hold what a run needs to go on as if it had not stopped."""
+"""What is stored of a run: its config.yml, and checkpoints that are whole or not there, and hold what the run needs to
+go on as if it had not stopped."""
 
 from __future__ import annotations
 
@@ -12,10 +13,29 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
 
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import partial_of, reading
 from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.terminal import say
+
+
+def read_config(path: Path) -> TrainerConfig:
+    """The configuration of a run, of any method.
+
+    Args:
+        path: Its config.yml.
+
+    Raises:
+        RecordingError: The file is missing, cannot be read, or is of no run.
+    """
+    with reading(path, "the config.yml of a run"):
+        config = yaml.load(path.read_text(), Loader=yaml.Loader)  # as Nerfstudio reads it
+    if not isinstance(config, TrainerConfig):
+        raise RecordingError(f"{path} is not the config.yml of a run; give the folder of a run.")
+    return config
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
@@ -47,14 +67,14 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether all of a checkpoint is there as it was written, by the checksums in it, and torch can read it."""
+    """Whether all of a checkpoint is there as it was written, by the checksums in it, and torch can read it as one."""
     try:
         with zipfile.ZipFile(path) as archive:
             sound = archive.testzip() is None
-        load_checkpoint(path)
+        state = load_checkpoint(path)
+        return sound and {"step", "pipeline", "optimizers"} <= state.keys()
     except Exception:  # of any kind, depending on where the damage lies
         return False
-    return sound
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -82,7 +102,7 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     content = io.BytesIO()
     torch.save(state, content)
-    partial = path.parent.with_name(".checkpoint.partial")
+    partial = partial_of(path.parent.with_name(path.name))
     try:
         with open(partial, "wb") as file:
             file.write(content.getbuffer())

@@ -31,16 +31,25 @@ from enerf_ns.checkpoints import (
     load_checkpoint,
     newest_checkpoint,
     random_state,
+    read_config,
     set_random_state,
     write_checkpoint,
 )
 from enerf_ns.choices import resolve
-from enerf_ns.dataparsers.errors import FlagError, OutputError, exit_with_a_sentence, printable, quoted
+from enerf_ns.dataparsers.errors import (
+    FlagError,
+    OutputError,
+    RecordingError,
+    exit_with_a_sentence,
+    printable,
+    quoted,
+)
 from enerf_ns.dataparsers.files import absolute, write_together
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.encodings.hash_grid import fitting
+from enerf_ns.enerf_model import EnerfModel
 from enerf_ns.enerf_pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.error_against_time import ErrorAgainstTime
 from enerf_ns.guarded_steps import (
@@ -85,6 +94,12 @@ class EnerfTrainerConfig(TrainerConfig):
     events at moments evenly spaced in log time (history.jsonl), and previews. All held-out frames are scored once more
     at the end, on top of that. 0: nothing is evaluated, at the end neither."""
 
+    def __post_init__(self) -> None:
+        """Looks at the config.yml that a flag names, since Nerfstudio reads it itself, with a traceback."""
+        if self.load_config is not None:
+            with exit_with_a_sentence():
+                read_config(absolute(self.load_config))
+
     def resolved(self) -> EnerfTrainerConfig:
         """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
         recording (`pipeline.resolution`), whose events are read and checked.
@@ -121,6 +136,8 @@ class EnerfTrainerConfig(TrainerConfig):
                 lambda filled: view_direction_gain(filled, optimizer, device),
                 lambda filled: batch_factor(filled, device),
             )
+        if checkpoint:
+            config._check_fits(checkpoint)
         index_events(config.recording())
         return config
 
@@ -154,6 +171,35 @@ class EnerfTrainerConfig(TrainerConfig):
             except ValueError as error:
                 raise FlagError(f"--pipeline.model.hash-grid: {error}.") from error
 
+    def _check_fits(self, checkpoint: Path) -> None:
+        """Refuses a checkpoint of another field, sensor or box of the scene than those of this config, when resolved.
+
+        Raises:
+            FlagError: It is such a one.
+        """
+        filled = self.pipeline.resolution.applied_to(self.pipeline)
+        parser = filled.datamanager.dataparser.setup()
+        box = parser.outputs(parser.recording(), "train").scene_box
+        with torch.random.fork_rng():
+            model: EnerfModel = filled.model.setup(scene_box=box, num_train_data=0)
+        state = load_checkpoint(checkpoint)
+        stored = {name.replace("_model.module.", "_model."): value for name, value in state["pipeline"].items()}
+        here = model.state_dict(prefix="_model.")
+        shapes = [
+            [name, *(tuple(side[name].shape) if name in side else "missing" for side in (stored, here))]
+            for name in (*here, *stored)
+        ]
+        other = [f"{name.removeprefix('_model.')} is {there}, but {mine} here" for name, there, mine in shapes
+                 if there != mine]  # fmt: skip
+        other += [f"{name} is learned" for name in state["optimizers"].keys() - model.get_param_groups().keys()]
+        if not other and not torch.allclose(*(side["_model.field.geometry.aabb"] for side in (stored, here))):
+            other = ["its scene has another box"]
+        if other:
+            raise FlagError(
+                f"The checkpoint {checkpoint} is of another configuration ({other[0]}); give the flags of its run, "
+                "which its config.yml states, or continue that run with --load-config."
+            )
+
     def recording(self) -> EventRecording:
         """The recording that is learnt from, of a config that is resolved."""
         return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
@@ -177,14 +223,18 @@ class EnerfTrainerConfig(TrainerConfig):
                 f"{quoted(folder.parent / 'config.yml')}, or give the new one another --timestamp."
             )
         if self.load_dir and self.load_step is None:
-            path = newest_checkpoint(self.load_dir)
+            try:
+                path = newest_checkpoint(self.load_dir)
+                found = "is no folder" if self.load_dir.exists() else "does not exist"
+            except RecordingError:
+                path, found = None, "holds no whole checkpoint"
             if path is None:
-                raise FlagError(f"--load-dir {self.load_dir} does not exist; give nerfstudio_models of a trained run.")
+                raise FlagError(f"--load-dir {self.load_dir} {found}; give nerfstudio_models of a trained run.")
         elif self.load_dir or self.load_checkpoint:
             path = checkpoint_path(self.load_dir, self.load_step or 0) if self.load_dir else self.load_checkpoint
             assert path is not None
             if not is_whole(path):
-                found = "is cut short or damaged" if path.exists() else "does not exist"
+                found = "is cut short, damaged or none" if path.exists() else "does not exist"
                 raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
         else:
             return None
@@ -272,6 +322,7 @@ class EnerfTrainer(Trainer):
         self._handlers: dict[int, Any] = {}
         self._cores: SharedCores | None = None  # while it trains on them
 
+    @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         config = self.config
         data, config.data = config.data, None  # so that the viewer keeps camera paths with the run
@@ -353,12 +404,14 @@ class EnerfTrainer(Trainer):
                 if other != path:
                     other.unlink()
 
+    @exit_with_a_sentence()
     def train(self) -> None:
         """Trains up to step `max_num_iterations` in total; interrupted by SIGINT or SIGTERM, stores a checkpoint first.
 
         Raises:
             SystemExit: With code 130, training was interrupted; with a sentence, it was given up, since steps in a row
-                were not finite, or the last checkpoint could not be stored.
+                were not finite, the last checkpoint could not be stored, or something else went wrong that the user can
+                mend.
         """
         config, total = self.config, self.config.max_num_iterations
         self._trained = self._start_step - 1

@@ -25,6 +25,7 @@ from small_runs import set_up, small_config
 
 from enerf_ns.checkpoints import is_whole, newest_checkpoint, random_state, set_random_state, write_checkpoint
 from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.files import partial_of
 
 SAVE = "import numpy as np, torch; torch.save({'lr': np.float64(0.01), 'other': np.float32(2.0)}, %r)"
 LOAD = "import torch; %s; print(float(torch.load(%r, weights_only=True)['lr']))"
@@ -209,7 +210,11 @@ def test_a_full_disk_keeps_the_last_checkpoint(copy: Path, capsys, monkeypatch):
         assert f"Step {step} could not be stored in {models} (File too large); the checkpoints before it stay." in said
     assert {file: file.read_bytes() for file in models.iterdir()} == before
     assert not list(copy.glob(".*"))
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    left = partial_of(copy / "step-000000003.ckpt").name.replace(str(os.getpid()), gone.stdout.strip())
+    (copy / left).write_bytes(b"of a process that was killed")
     set_up(config).train()
+    assert not list(copy.glob(".*"))
     assert [file.name for file in models.iterdir()] == ["step-000000005.ckpt"]
 
 

@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import main
 from nerfstudio.utils import writer
 from small_runs import set_up, small_config
 
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.enerf_trainer import EnerfTrainer, EnerfTrainerConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -239,13 +240,85 @@ def test_what_is_left_is_told_of_the_run_as_a_whole(recording: Path, tmp_path: P
     assert not any("h" in left for _, left in shares)
 
 
-@pytest.mark.parametrize(("flag", "value"), [("load_dir", "nowhere"), ("load_checkpoint", "nowhere.ckpt")])
-def test_a_checkpoint_that_is_not_there_is_one_sentence(recording: Path, tmp_path: Path, flag: str, value: str):
-    config = small_config(recording, tmp_path)
-    setattr(config, flag, tmp_path / value)
-    with pytest.raises(SystemExit, match=r"^enerf: .*nowhere.* does not exist; give "):
+@pytest.mark.parametrize(
+    ("flag", "content", "sentence"),
+    [
+        ("load_dir", None, "does not exist; give nerfstudio_models of a trained run"),
+        ("load_dir", b"a file", "is no folder; give nerfstudio_models of a trained run"),
+        ("load_dir", {"notes.txt": b"stray", "step-000000001.ckpt": b"stray"}, "holds no whole checkpoint; give nerf"),
+        ("load_checkpoint", None, "does not exist; give another"),
+        ("load_checkpoint", b"stray", "is cut short, damaged or none; give another"),
+    ],
+)
+def test_a_checkpoint_that_is_none_is_one_sentence(
+    recording: Path, tmp_path: Path, flag: str, content: Any, sentence: str
+):
+    named = tmp_path / "named"
+    if isinstance(content, bytes):
+        named.write_bytes(content)
+    for name, inside in content.items() if isinstance(content, dict) else ():
+        named.mkdir(exist_ok=True)
+        (named / name).write_bytes(inside)
+    config = small_config(recording, tmp_path / "outputs")
+    setattr(config, flag, named)
+    with pytest.raises(SystemExit, match=rf"^enerf: [^\n]*{named} {sentence}[^\n]*\.$"):
+        config.save_config()
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"model__num_levels": 5}, r"field\.geometry\.grid\.table is \(\d+, 2\), but \(\d+, 2\) here"),
+        ({"model__sampling": "uniform"}, r"proposal\.\S+ is \([\d, ]+\), but missing here"),
+        ({"sensor__learn_threshold_ratio": True}, r"sensor\.log_ratio is missing, but \(\) here"),
+        ({"box": (0.0, 0.0, 1.0, 3.0)}, "its scene has another box"),
+    ],
+)
+def test_a_checkpoint_of_another_configuration_is_one_sentence(
+    recording: Path, first: Any, tmp_path: Path, changes: dict, what: str
+):
+    config = small_config(recording, tmp_path, **{name: value for name, value in changes.items() if name != "box"})
+    config.pipeline.datamanager.dataparser.box = changes.get("box")
+    config.max_num_iterations, config.load_dir = 5, first.checkpoint_dir
+    with pytest.raises(
+        SystemExit, match=rf"^enerf: The checkpoint [^\n]* is of another configuration \({what}\); give"
+    ):
         config.save_config()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def first(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A trained run of two steps."""
+    trainer = set_up(small_config(recording, tmp_path_factory.mktemp("first")))
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x7fELF\xd0", b"a: 1", b"!!python/object:no.Such {}"])
+def test_a_config_that_is_none_is_one_sentence_as_soon_as_the_flag_is_read(tmp_path: Path, content: bytes | None):
+    """Before Nerfstudio reads it itself."""
+    file = tmp_path / "config.yml"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(SystemExit, match=rf"^enerf: {file} [^\n]*\.$"):
+        EnerfTrainerConfig(method_name="enerf", load_config=file)
+
+
+@pytest.mark.parametrize("where", ["_finish", "setup"])
+def test_an_interruption_outside_of_steps_is_one_line(recording: Path, tmp_path: Path, monkeypatch, capfd, where: str):
+    """Nerfstudio would print a traceback, and exit with 0."""
+
+    def interrupted(self: Any, step: Any = None) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(*((Trainer, "setup") if where == "setup" else (EnerfTrainer, "_finish")), interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        main(small_config(recording, tmp_path))
+    shown = capfd.readouterr()
+    assert stopped.value.code == 130 and "enerf: Stopped." in shown.err
+    assert "Traceback" not in shown.out + shown.err
 
 
 def test_a_run_in_the_background_goes_on(recording: Path, tmp_path: Path):

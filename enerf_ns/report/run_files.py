@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-import yaml
-
-from enerf_ns.checkpoints import newest_checkpoint
+from enerf_ns.checkpoints import newest_checkpoint, read_config
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
@@ -72,17 +70,13 @@ def read_run(path: Path) -> RunFiles:
         RecordingError: It is no run, or one of a method of another package, or its files cannot be read.
     """
     from nerfstudio.configs.method_configs import all_methods
-    from nerfstudio.engine.trainer import TrainerConfig
 
     path = absolute(path)
     config_file = path / "config.yml" if path.is_dir() else path
     if not config_file.exists():
         found = "holds no config.yml" if path.is_dir() else "does not exist"
         raise RecordingError(f"{path} {found}; give the folder of a run, of several, or a config.yml.")
-    with reading(config_file, "the config.yml of a run"):
-        config = yaml.load(config_file.read_text(), Loader=yaml.Loader)  # as Nerfstudio reads it
-    if not isinstance(config, TrainerConfig):
-        raise RecordingError(f"{config_file} is not the config.yml of a run; give the folder of a run.")
+    config = read_config(config_file)
     if not isinstance(config, type(all_methods["enerf"])):
         raise RecordingError(
             f"{config_file} is a run of the method {config.method_name}; give the folder of a run of enerf."

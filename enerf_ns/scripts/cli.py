@@ -56,6 +56,3 @@ def _run(name: str, arguments: list[str]) -> None:
     except MemoryError as error:
         asked = printable(shlex.join(["enerf", name, *arguments]))
         raise SystemExit(f"enerf: There is not enough memory for {asked}; ask for less at a time.") from error
-    except KeyboardInterrupt as error:
-        print("enerf: Stopped.", file=sys.stderr)
-        raise SystemExit(130) from error
