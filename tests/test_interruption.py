@@ -17,7 +17,8 @@ from nerfstudio.scripts.train import main
 from nerfstudio.utils import writer
 from small_runs import set_up, small_config
 
-from enerf_ns.enerf_trainer import EnerfTrainer, EnerfTrainerConfig
+from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.error_against_time import ErrorAgainstTime
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -306,14 +307,16 @@ def test_a_config_that_is_none_is_one_sentence_as_soon_as_the_flag_is_read(tmp_p
         EnerfTrainerConfig(method_name="enerf", load_config=file)
 
 
-@pytest.mark.parametrize("where", ["_finish", "setup"])
-def test_an_interruption_outside_of_steps_is_one_line(recording: Path, tmp_path: Path, monkeypatch, capfd, where: str):
+@pytest.mark.parametrize(("of", "name"), [(Trainer, "setup"), (ErrorAgainstTime, "finish")])
+def test_an_interruption_outside_of_steps_is_one_line(
+    recording: Path, tmp_path: Path, monkeypatch, capfd, of: type, name: str
+):
     """Nerfstudio would print a traceback, and exit with 0."""
 
-    def interrupted(self: Any, step: Any = None) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(*((Trainer, "setup") if where == "setup" else (EnerfTrainer, "_finish")), interrupted)
+    monkeypatch.setattr(of, name, interrupted)
     with pytest.raises(SystemExit) as stopped:
         main(small_config(recording, tmp_path))
     shown = capfd.readouterr()
