@@ -115,7 +115,8 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         raise
     except Exception as error:  # of any kind, since libraries have their own for what is damaged
         _check_can_be_read(path, expected)
-        lines = str(error).strip("\"' \n").splitlines() or [type(error).__name__]
+        told = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)  # which would be quoted
+        lines = told.strip().splitlines() or [type(error).__name__]
         reason = lines[0].rstrip(".").replace(". ", ", ")
         raise RecordingError(
             f"{path} cannot be read as {expected} ({reason}); copy it again from its source."

@@ -88,6 +88,7 @@ def test_what_a_library_raises_becomes_one_sentence(tmp_path: Path):
     assert found == f"{path} cannot be read as a clay tablet (It is cracked, Very); copy it again from its source."
     assert "(KeyError)" in sentence(path, KeyError())
     assert "(column)" in sentence(path, KeyError("column"))
+    assert "('utf-8' codec)" in sentence(path, ValueError("'utf-8' codec"))
     with pytest.raises(FlagError), reading(path, "a clay tablet"):
         raise FlagError("--box")
 
