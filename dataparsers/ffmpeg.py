@@ -22,6 +22,8 @@ def make_ffmpeg_available() -> None:
         return
     try:
         folder = user_cache_path("enerf-ns", appauthor=False) / "bin"
+        if not folder.is_absolute():  # as of a home folder that is not known
+            return
         if shutil.which("ffmpeg", path=str(folder)) is None:
             _link_ffmpeg_into(folder)
     except (ImportError, OSError, RuntimeError):  # RuntimeError: no home folder, or no binary for this platform

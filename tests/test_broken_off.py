@@ -1,0 +1,65 @@
+"""What commands leave that are killed, or whose disk is full."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="needs fork and memfd_create, as of Linux"),
+]
+
+KINDS = {"index", "train", "checkpoint", "report", "convert", "simulate"}
+
+
+def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[str, int]:
+    """How often each kind of command was broken off, after all was as it should be each time."""
+    here = Path(__file__).parent
+    environment = {
+        "OMP_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+        "NUMBA_THREADING_LAYER": "workqueue",  # the one whose processes may be forked
+        "ENERF_LPIPS_WEIGHTS": str(folder / "none"),
+        "PYTHONPATH": str(here),
+    }
+    run = subprocess.run(
+        [sys.executable, here / "broken_off.py", how, recording, folder, str(kills)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr[-4000:]
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+@pytest.mark.timeout(2400)
+def test_nothing_is_lost_or_half_written_where_processes_are_killed(recording: Path, tmp_path: Path):
+    """Each at 50 random moments, spread over the whole time that it takes. The next start works, what was left is gone
+    then, and a run that goes on ends with the weights of one that was never killed."""
+    assert broken_off("kill", recording, tmp_path, 50) == dict.fromkeys(KINDS, 50)
+
+
+def test_files_that_cannot_grow_leave_nothing_half_written(recording: Path, tmp_path: Path):
+    """As on a full disk, on which each write may take a part of what it is given; one sentence, and no traceback."""
+    number = broken_off("small-files", recording, tmp_path)
+    assert number.keys() == KINDS and min(number.values()) >= 3
+
+
+def test_full_disks_leave_nothing_half_written(recording: Path, tmp_path: Path):
+    disk = tmp_path / "tried"
+    disk.mkdir()
+    if shutil.which("mount") is None:
+        pytest.skip("there is no command to mount a disk")
+    mount = subprocess.run(["mount", "-t", "tmpfs", "tmpfs", disk], capture_output=True, text=True)
+    if mount.returncode:
+        pytest.skip(f"no disk can be mounted here: {mount.stderr.strip()}")
+    subprocess.run(["umount", disk], check=True)
+    number = broken_off("small-disk", recording, tmp_path)
+    assert number.keys() == KINDS and min(number.values()) >= 2
