@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import signal
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -545,8 +546,9 @@ class EnerfTrainer(Trainer):
         say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
 
     def _train_complete_viewer(self) -> None:
-        self._restore_signals()  # the viewer runs until it is interrupted
-        super()._train_complete_viewer()
+        self._restore_signals()
+        with suppress(KeyboardInterrupt):  # until which the viewer runs
+            super()._train_complete_viewer()
 
     def _after_train(self) -> None:
         self.step = self._trained  # where training was stopped, Nerfstudio has counted one further
