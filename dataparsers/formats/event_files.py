@@ -163,7 +163,9 @@ def _sensor_size(path: Path, stated: dict[str, str]) -> tuple[int, int] | None:
     if not width and not height:
         return None
     if not (width.isdecimal() and height.isdecimal() and 0 < int(width) < 2**16 and 0 < int(height) < 2**16):
-        raise RecordingError(f"{path} states a sensor of {width} x {height}, but whole pixels above 0 were expected.")
+        raise RecordingError(
+            f"{path} states a sensor of {width} x {height}, but whole pixels from 1 to 65535 were expected."
+        )
     return int(width), int(height)
 
 

@@ -182,12 +182,17 @@ def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
         camera = _pinhole(settings)
         rig = camera, camera, np.eye(4)
     for camera in rig[:2]:
-        if camera.width * camera.height > MOST_PIXELS:
-            raise FlagError(
-                f"A camera of {camera.width} x {camera.height} pixels is too large to be simulated; give one of at "
-                f"most {MOST_PIXELS:,} pixels."
-            )
+        _check_size(camera.width, camera.height)
     return rig
+
+
+def _check_size(width: int, height: int) -> None:
+    """Raises a FlagError for a camera that takes too long to simulate."""
+    if width * height > MOST_PIXELS:
+        raise FlagError(
+            f"A camera of {width} x {height} pixels is too large to be simulated; give one of at most {MOST_PIXELS:,} "
+            "pixels."
+        )
 
 
 def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera:
@@ -204,6 +209,7 @@ def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera
 
 def _centred(width: int, height: int, field_of_view: float) -> Camera:
     """A pinhole camera that looks through the middle of its picture, as the ESIM layout wants it; degrees."""
+    _check_size(width, height)
     focal_length = float(width / 2 / np.tan(np.radians(field_of_view / 2)))
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 

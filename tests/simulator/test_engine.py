@@ -339,10 +339,11 @@ def test_frames_are_as_dense_whatever_the_duration(tmp_path, duration, num_frame
 
 
 def test_pictures_need_no_layout(tmp_path):
+    (tmp_path / "pictures").mkdir()
     for number in range(30):
         picture = np.full((12, 16), 60 + 60 * (number % 3), np.uint8)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
-    simulate(SimulationSettings(str(tmp_path), frames_per_second=30), tmp_path / "new")
+        cv2.imwrite(str(tmp_path / "pictures" / f"{number}.png"), picture)
+    simulate(SimulationSettings(str(tmp_path / "pictures"), frames_per_second=30), tmp_path / "new")
     assert (tmp_path / "new/recording.json").exists()
 
 
