@@ -69,6 +69,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "silence_ms": (2e-6, 1e9),  # from 2 ns, which two instants need
     "train_num_rays_per_batch": (1, MOST_DRAWS),
     "rays_beside_events": (1, MOST_DRAWS),
+    "noisy_pairs_beside_frames": (1, MOST_DRAWS),
     "exposure_samples": (1, 4096),
     "eval_num_rays_per_batch": (1, MOST_DRAWS),
     "train_num_images_to_sample_from": (-1, 10**9),  # -1: all
