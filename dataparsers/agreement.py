@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,19 +28,16 @@ MILLISECOND = 1_000_000
 COARSE_STEP, FINE_STEP, FINE_REACH = 5 * MILLISECOND, MILLISECOND, 5 * MILLISECOND
 """Steps (ns) in which delays are searched: over all, and then around the best."""
 
-SCALE_STEP, COARSE_SCALES = math.log(1.05), range(-18, 19, 2)
-"""Logarithm of the ratio between neighbouring scales of the focal length, and those that are tried first, as multiples
-of it: from 0.42 to 2.4, since a calibration may be that of another lens."""
+FOCAL_SCALES = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2)
 
 SCALE_REACH = 0.06
-"""How far from the best logarithm of the scale others count when it is refined."""
+"""How far from the best scale others count when it is refined."""
 
 LARGEST_DELAY_ERROR = 3.0
 """Milliseconds of standard error up to which a delay is said to be told."""
 
-LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE = 0.02, 0.1
-"""Standard error of the logarithm of the focal length's scale up to which it is said to be told, and the same as a
-share of that logarithm: of a lens that is far off, less is needed to say so."""
+LARGEST_SCALE_ERROR = 0.02
+"""Standard error up to which the scale of the focal length is said to be told."""
 
 FEWEST_SAMPLES = 3
 """Fewest frames, or tiles of windows, from which an error can be estimated."""
@@ -126,32 +123,24 @@ class Agreement:
                 focus.largest_delay,
             )
 
-        def scale_of(reading: Reading, delay: float) -> Estimate:
-            def height_of(steps: np.ndarray) -> np.ndarray:
-                scales = np.exp(steps * SCALE_STEP).tolist()
-                return curve([Hypothesis(round(delay * MILLISECOND), scale, reading) for scale in scales])
-
-            return _scale(height_of, lambda steps: focus.allows(math.exp(steps * SCALE_STEP)))
+        def scale_of(reading: Reading, delay: Estimate) -> Estimate:
+            scales, known = [scale for scale in FOCAL_SCALES if focus.allows(scale)], delay.value * delay.is_told
+            curves = curve([Hypothesis(round(known * MILLISECOND), scale, reading) for scale in scales])
+            return _estimate(np.array(scales), curves, SCALE_REACH, LARGEST_SCALE_ERROR)
 
         pose_delay = delay_of(AS_READ, 1.0)
         best_delay = round(pose_delay.value * MILLISECOND)
-        candidates, other_lens = [Hypothesis(), Hypothesis(best_delay)], scale_of(AS_READ, 0.0)
-        if other_lens.is_told and abs(other_lens.value - 1) > HARMFUL_SCALE:  # it may explain more than a clock does
-            candidates.append(Hypothesis(0, other_lens.value))
-        best = candidates[int(curve(candidates).sum(1).argmax())]
         heights = {
-            reading: float(curve([replace(hypothesis, reading=reading) for hypothesis in candidates]).sum(1).max())
+            reading: float(curve([Hypothesis(0, 1.0, reading), Hypothesis(best_delay, 1.0, reading)]).sum(1).max())
             for reading in (AS_READ, *READINGS)
         }
         readings, is_clear = _best_readings(recording.trajectory, heights)
         if AS_READ not in readings:
             pose_delay = delay_of(readings[0], 1.0)
-        elif best.focal_scale != 1.0:
-            pose_delay = delay_of(AS_READ, best.focal_scale)
-        focal_scale = scale_of(readings[0], pose_delay.value * pose_delay.is_told)
+        focal_scale = scale_of(readings[0], pose_delay)
         if focal_scale.is_told and abs(focal_scale.value - 1) > HARMFUL_SCALE / 2:  # either hides some of the other
             pose_delay = delay_of(readings[0], focal_scale.value)
-            focal_scale = scale_of(readings[0], pose_delay.value * pose_delay.is_told)
+            focal_scale = scale_of(readings[0], pose_delay)
         curve([hypothesis for hypothesis in shown_hypotheses() if focus.allows(hypothesis.focal_scale)])
 
         edges, plane, frame_delay = FrameEdges.of(recording, (near, far), focus.largest_delay), 0, None
@@ -272,7 +261,7 @@ class Agreement:
             yield Problem(
                 f"The focal length is wrong: {scale.value:.3f} ± {scale.error:.3f} of the stated one fits the events "
                 f"best, {scale.value * self.focus.recording.camera.fx:.1f} pixels.",
-                "Check the calibration, and whether it is of this lens and this resolution of the sensor.",
+                "Check the calibration, and whether it is of this resolution of the sensor.",
             )
 
     def _lateness(self) -> dict[str, float]:
@@ -322,25 +311,6 @@ def _delay(curve: Callable[[np.ndarray], np.ndarray], largest: int) -> Estimate:
     curves, delays = np.concatenate([curves, curve(around)]), np.append(delays, around)
     order = np.argsort(delays)
     return _estimate(delays[order] / MILLISECOND, curves[order], FINE_REACH / MILLISECOND, LARGEST_DELAY_ERROR)
-
-
-def _scale(curve: Callable[[np.ndarray], np.ndarray], allows: Callable[[int], bool]) -> Estimate:
-    """The scale of the highest curve, searched in steps of `SCALE_STEP`, first in coarse ones.
-
-    Args:
-        curve: Of scales, as numbers of steps from 1.
-        allows: Whether there can be such a scale.
-    """
-    steps = np.array([step for step in COARSE_SCALES if allows(step)])
-    curves = curve(steps)
-    best = int(steps[curves.sum(1).argmax()])
-    around = np.array([step for step in (best - 1, best + 1) if allows(step)], dtype=int)
-    steps, curves = np.append(steps, around), np.concatenate([curves, curve(around)]) if len(around) else curves
-    order = np.argsort(steps)
-    found = _estimate(steps[order] * SCALE_STEP, curves[order], SCALE_REACH, math.inf)
-    largest = max(LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE * abs(found.value))
-    scale = math.exp(found.value)
-    return Estimate(scale, scale * found.error, found.is_told and found.error <= largest)
 
 
 def _estimate(

@@ -33,7 +33,7 @@ def call(
 
 def test_commands_that_are_printed_can_be_pasted(call, tmp_path: Path):
     folder = tmp_path / "my [bold]rooms"
-    note, _, made, *commands = call("carpet", "--output-dir", folder.name, "--color")
+    note, made, *commands = call("carpet", "--output-dir", folder.name, "--color")
     assert note == "note: --colour changes nothing, since carpet is grey."
     assert made.endswith(f" events and 11 frames of 0.1 s are in {folder}")
     assert [shlex.split(command.split(": ")[1]) for command in commands] == [
