@@ -148,7 +148,7 @@ class EnerfTrainerConfig(TrainerConfig):
         Raises:
             OutputError: It is the one that is set.
         """
-        check_outside_recordings("--output-dir", self.get_base_dir(), self.data)
+        check_outside_recordings("--output-dir", self.get_base_dir())
         there = next(folder for folder in (self.output_dir, *self.output_dir.parents) if folder.exists())
         try:
             with TemporaryFile(dir=there):

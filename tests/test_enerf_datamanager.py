@@ -83,7 +83,7 @@ def test_the_mean_over_the_instants_is_what_the_simulated_camera_recorded(tmp_pa
     simulate(SimulationSettings("shapes", width=32, height=24, duration=0.5, num_frames=11, exposure_ms=40.0), folder)
     config = small_config(
         folder,
-        tmp_path,
+        tmp_path / "outputs",
         data__supervision="frames",
         data__train_num_rays_per_batch=12 * 32,
         data__exposure_samples=32,

@@ -89,7 +89,7 @@ def moved(thing: Any, to_gpu: Any, known: dict[int, Any]) -> Any:
 def test_a_step_reads_nothing_from_the_gpu(recording: Path, tmp_path: Path, name: str) -> None:
     """Drawing, rays, rendering, losses and metrics, with all tensors where they belong."""
     own = shutil.copytree(recording, tmp_path / "copied")  # which later tests do not read from a cache
-    pipeline = set_up(small_config(own, tmp_path, model__hash_grid="torch", **SETTINGS[name])).pipeline
+    pipeline = set_up(small_config(own, tmp_path / "outputs", model__hash_grid="torch", **SETTINGS[name])).pipeline
     pipeline.get_train_loss_dict(0)  # what is made when first asked for
     with FakeTensorMode(allow_non_fake_inputs=True) as fake:
 

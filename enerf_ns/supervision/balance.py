@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.distributed import all_reduce, get_world_size, is_initialized
 
 MEMORY = 0.99
 """Share of the mean error that one step leaves of that before it."""
@@ -38,6 +39,9 @@ class FrameBalance(nn.Module):
             num_pixels: Their number.
         """
         seen = torch.stack([events.detach(), frames.detach(), torch.ones_like(events)]).to(self.errors)
+        if is_initialized():
+            all_reduce(seen)  # of as many pairs and pixels in each process
+            seen = seen / get_world_size()
         if self.training:
             self.errors += (1.0 - MEMORY) * (torch.where(seen.isfinite().all(), seen, self.errors) - self.errors)
         means = torch.where(self.errors[2] > 0.0, self.errors, seen)

@@ -179,8 +179,8 @@ def test_counts_of_a_blind_sensor_tell_nothing(tmp_path: Path):
 
 
 def test_events_of_one_polarity_tell_nothing(tmp_path: Path):
-    times = np.arange(1, 100) * 10**7
-    events = Events(np.zeros(99, int), np.zeros(99, int), times, np.ones(99, int))
+    times, pixels = np.repeat(np.arange(1, 100) * 10**7, 64), np.tile(np.arange(64), 99)
+    events = Events(pixels % 8, pixels // 8, times, np.ones(len(times), int))
     on, off, is_measured = contrast_thresholds(recording_of(events, tmp_path), blind=False)
     assert (on.value, off.value, on.error, off.error, is_measured) == (0.25, 0.25, math.inf, math.inf, False)
 

@@ -223,7 +223,7 @@ def test_without_esim_conf_the_sensor_is_grey_and_its_thresholds_are_unknown(tmp
         ("--simulate_color_events=1\r\n--refractory_period_ns=5\r\n", ((1.0, 1.0), 5, "RGGB")),
         ("-simulate_color_events\n--nosimulate_color_events", ((1.0, 1.0), 0, None)),
         ("--simulate_color_events=False\n--contrast_threshold_neg=.1", ((1.0, 0.1), 0, None)),
-        ("#--simulate_color_events\nsimulate_color_events=true\n", ((1.0, 1.0), 0, None)),
+        ("#--simulate_color_events\n", ((1.0, 1.0), 0, None)),
     ],
 )
 def test_flags_as_the_simulator_reads_them(tmp_path: Path, flags: str, expected: tuple):
