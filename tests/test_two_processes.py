@@ -11,11 +11,15 @@ import torch.distributed
 from small_runs import set_up, small_config
 from torch.multiprocessing.spawn import spawn
 
+from enerf_ns.supervision.balance import FrameBalance
+
 STEPS = 4
 
 
 def two_process_config(recording: Path, folder: Path) -> Any:
-    config = small_config(recording, folder, data__supervision="events+frames", data__silent_pairs=32)
+    config = small_config(
+        recording, folder, data__supervision="events+frames", data__silent_pairs=32, model__frame_loss_weight=10.0
+    )  # a weight by errors would be that of both batches
     config.max_num_iterations = STEPS
     return config
 
@@ -71,3 +75,20 @@ def test_two_processes_train_as_one_would_with_both_batches(recording: Path, tmp
         for name, value in field.items():
             assert torch.equal(one[step]["field"][name], other[step]["field"][name]), name
             torch.testing.assert_close(one[step]["field"][name], value, rtol=1e-5, atol=1e-7)
+
+
+def weigh_one_of_two(rank: int, folder: Path) -> None:
+    """What one process does; the weight that it finds and what it remembers are stored."""
+    torch.distributed.init_process_group("gloo", f"file://{folder / 'meet'}", rank=rank, world_size=2)
+    balance = FrameBalance()
+    weight = balance(torch.tensor(1.0 + 2.0 * rank), 100, torch.tensor(0.1 + 0.3 * rank), 50)
+    torch.save((weight, balance.errors), folder / f"{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_two_processes_weigh_frames_by_the_errors_of_both(tmp_path: Path) -> None:
+    spawn(weigh_one_of_two, (tmp_path,), nprocs=2)
+    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    torch.testing.assert_close(one, other, rtol=0, atol=0)
+    torch.testing.assert_close(one[0], torch.tensor(50 / 100 * 2.0 / 0.25))
