@@ -82,6 +82,8 @@ def weigh_one_of_two(rank: int, folder: Path) -> None:
     torch.distributed.init_process_group("gloo", f"file://{folder / 'meet'}", rank=rank, world_size=2)
     balance = FrameBalance()
     weight = balance(torch.tensor(1.0 + 2.0 * rank), 100, torch.tensor(0.1 + 0.3 * rank), 50)
+    if rank == 0:  # which alone evaluates, and must not wait for the other
+        assert balance.eval()(torch.tensor(9.0), 1, torch.tensor(9.0), 1) == 2.0 / 0.25
     torch.save((weight, balance.errors), folder / f"{rank}.pt")
     torch.distributed.destroy_process_group()
 

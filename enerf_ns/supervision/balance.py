@@ -39,10 +39,10 @@ class FrameBalance(nn.Module):
             num_pixels: Their number.
         """
         seen = torch.stack([events.detach(), frames.detach(), torch.ones_like(events)]).to(self.errors)
-        if is_initialized():
-            all_reduce(seen)  # of as many pairs and pixels in each process
-            seen = seen / get_world_size()
         if self.training:
+            if is_initialized():
+                all_reduce(seen)  # of as many pairs and pixels in each process; only one of them evaluates
+                seen = seen / get_world_size()
             self.errors += (1.0 - MEMORY) * (torch.where(seen.isfinite().all(), seen, self.errors) - self.errors)
         means = torch.where(self.errors[2] > 0.0, self.errors, seen)
         return num_pixels / num_pairs * means[0] / means[1].clamp(min=1e-12)
