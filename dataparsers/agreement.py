@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,6 +29,18 @@ COARSE_STEP, FINE_STEP, FINE_REACH = 5 * MILLISECOND, MILLISECOND, 5 * MILLISECO
 """Steps (ns) in which delays are searched: over all, and then around the best."""
 
 FOCAL_SCALES = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2)
+"""Multiples of a focal length among which the best is looked for."""
+
+OTHER_LENSES = tuple(1.2**step for step in range(-10, 11) if step)
+"""Multiples of the stated focal length, from 0.16 to 6.2, that are tried since a calibration may be of another lens."""
+
+LENS_GAIN = 1.05
+"""Factor by which events must be sharper with another lens than with the stated one for the best to be looked for there;
+they are so by 1.1 where the focal length is wrong by a fifth."""
+
+SMALLEST_TURN = math.radians(0.5)
+"""By how much the camera must turn within a window for another lens to be looked for: without turns it trades with depth,
+and the sharpest one is far off."""
 
 SCALE_REACH = 0.06
 """How far from the best scale others count when it is refined."""
@@ -36,8 +48,9 @@ SCALE_REACH = 0.06
 LARGEST_DELAY_ERROR = 3.0
 """Milliseconds of standard error up to which a delay is said to be told."""
 
-LARGEST_SCALE_ERROR = 0.02
-"""Standard error up to which the scale of the focal length is said to be told."""
+LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE = 0.02, 0.1
+"""Standard error up to which the scale of the focal length is said to be told, and the same as a share of how far off it
+is: of another lens, less needs to be known."""
 
 FEWEST_SAMPLES = 3
 """Fewest frames, or tiles of windows, from which an error can be estimated."""
@@ -123,24 +136,29 @@ class Agreement:
                 focus.largest_delay,
             )
 
-        def scale_of(reading: Reading, delay: Estimate) -> Estimate:
-            scales, known = [scale for scale in FOCAL_SCALES if focus.allows(scale)], delay.value * delay.is_told
+        def scale_of(reading: Reading, delay: Estimate, lens: float) -> Estimate:
+            scales, known = [lens * scale for scale in FOCAL_SCALES], delay.value * delay.is_told
+            scales = [scale for scale in scales if focus.allows(scale)]
             curves = curve([Hypothesis(round(known * MILLISECOND), scale, reading) for scale in scales])
-            return _estimate(np.array(scales), curves, SCALE_REACH, LARGEST_SCALE_ERROR)
+            largest = max(LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE * abs(lens - 1))
+            return _estimate(np.array(scales), curves, lens * SCALE_REACH, largest)
 
         pose_delay = delay_of(AS_READ, 1.0)
-        best_delay = round(pose_delay.value * MILLISECOND)
+        stated = [Hypothesis(), Hypothesis(round(pose_delay.value * MILLISECOND))]
+        other = _other_lens(focus, stated, curve) if focus.turn >= SMALLEST_TURN else None
+        tried_for_all = stated + [other] * (other is not None)
         heights = {
-            reading: float(curve([Hypothesis(0, 1.0, reading), Hypothesis(best_delay, 1.0, reading)]).sum(1).max())
+            reading: float(curve([replace(hypothesis, reading=reading) for hypothesis in tried_for_all]).sum(1).max())
             for reading in (AS_READ, *READINGS)
         }
         readings, is_clear = _best_readings(recording.trajectory, heights)
-        if AS_READ not in readings:
-            pose_delay = delay_of(readings[0], 1.0)
-        focal_scale = scale_of(readings[0], pose_delay)
+        lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
+        if AS_READ not in readings or lens != 1.0:
+            pose_delay = delay_of(readings[0], lens)
+        focal_scale = scale_of(readings[0], pose_delay, lens)
         if focal_scale.is_told and abs(focal_scale.value - 1) > HARMFUL_SCALE / 2:  # either hides some of the other
             pose_delay = delay_of(readings[0], focal_scale.value)
-            focal_scale = scale_of(readings[0], pose_delay)
+            focal_scale = scale_of(readings[0], pose_delay, lens)
         curve([hypothesis for hypothesis in shown_hypotheses() if focus.allows(hypothesis.focal_scale)])
 
         edges, plane, frame_delay = FrameEdges.of(recording, (near, far), focus.largest_delay), 0, None
@@ -203,6 +221,9 @@ class Agreement:
 
     def problems(self) -> list[Problem]:
         """What contradicts the events, the gravest first."""
+        focal = list(self._focal_problems())
+        if focal and not FOCAL_SCALES[0] <= self.focal_scale.value <= FOCAL_SCALES[-1]:
+            return focal  # as long as the lens is another one, poses and clocks do not fit either
         if not self.is_clear:
             return [
                 Problem(
@@ -211,7 +232,7 @@ class Agreement:
                     "Check that the poses are those of this recording, the unit of their times, and the calibration.",
                 )
             ]
-        return [*self._pose_problems(), *self._clock_problems(), *self._focal_problems()]
+        return [*self._pose_problems(), *self._clock_problems(), *focal]
 
     def _pose_problems(self) -> Iterator[Problem]:
         if AS_READ not in self.readings:
@@ -261,7 +282,7 @@ class Agreement:
             yield Problem(
                 f"The focal length is wrong: {scale.value:.3f} ± {scale.error:.3f} of the stated one fits the events "
                 f"best, {scale.value * self.focus.recording.camera.fx:.1f} pixels.",
-                "Check the calibration, and whether it is of this resolution of the sensor.",
+                "Check the calibration, and whether it is of this lens and this resolution of the sensor.",
             )
 
     def _lateness(self) -> dict[str, float]:
@@ -311,6 +332,22 @@ def _delay(curve: Callable[[np.ndarray], np.ndarray], largest: int) -> Estimate:
     curves, delays = np.concatenate([curves, curve(around)]), np.append(delays, around)
     order = np.argsort(delays)
     return _estimate(delays[order] / MILLISECOND, curves[order], FINE_REACH / MILLISECOND, LARGEST_DELAY_ERROR)
+
+
+def _other_lens(
+    focus: EventFocus,
+    stated: list[Hypothesis],
+    curve: Callable[[list[Hypothesis]], Float64[np.ndarray, "hypotheses samples"]],
+) -> Hypothesis | None:
+    """The focal length, far from the stated one, that makes events clearly sharper; None if there is none."""
+    lenses = [lens for lens in OTHER_LENSES if focus.allows(lens)]
+    hypotheses = [replace(hypothesis, focal_scale=lens) for lens in lenses for hypothesis in stated]
+    heights = curve(hypotheses).sum(1).reshape(len(lenses), -1)
+    best = int(heights.max(1).argmax())
+    is_top = 0 < best < len(lenses) - 1
+    if not is_top or heights[best].max() < LENS_GAIN * curve(stated).sum(1).max():
+        return None
+    return replace(stated[heights[best].argmax()], focal_scale=lenses[best])
 
 
 def _estimate(

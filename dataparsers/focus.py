@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -174,6 +175,16 @@ class EventFocus:
     def speed(self) -> float:
         """Pixels a second that the picture moves in the fastest windows (90th percentile)."""
         return float(np.percentile([window.speed for window in self.windows], 90))
+
+    @cached_property
+    def turn(self) -> float:
+        """Radians by which the line of sight turns away from where it is in the middle of a window, the most of all."""
+        turns = []
+        for window in self.windows:
+            times = np.append(evenly_spaced(window.start, window.end, 17), window.instant)
+            sights = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()[:, :, 2]
+            turns.append(np.linalg.norm(np.cross(sights[:-1], sights[-1]), axis=1).max())
+        return float(max(turns))
 
     def sharpness(self, hypothesis: Hypothesis = AS_STATED) -> Float64[np.ndarray, "windows*tiles"]:
         """Sharpness of each tile at its best depth, as a share of the sum over the tiles of a window."""
