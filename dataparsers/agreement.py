@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.focus import (
     AS_READ,
     AS_STATED,
@@ -20,6 +21,7 @@ from enerf_ns.dataparsers.focus import (
     Reading,
 )
 from enerf_ns.dataparsers.frame_edges import FrameEdges
+from enerf_ns.dataparsers.frame_tracks import FrameTracks
 from enerf_ns.dataparsers.problems import Problem
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
@@ -34,13 +36,20 @@ FOCAL_SCALES = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2)
 OTHER_LENSES = tuple(1.2**step for step in range(-10, 11) if step)
 """Multiples of the stated focal length, from 0.16 to 6.2, that are tried since a calibration may be of another lens."""
 
+FRAME_SCALES = tuple(1.02**step for step in range(-92, 93))
+"""Multiples of the focal length of frames that are tried."""
+
+SMALLEST_FIT = 0.6
+"""Share of all corners' possible misses by which they must be missed less, for frames to tell a focal length: where no
+focal length fits, something else is wrong."""
+
 LENS_GAIN = 1.05
-"""Factor by which events must be sharper with another lens than with the stated one for the best to be looked for there;
-they are so by 1.1 where the focal length is wrong by a fifth."""
+"""Factor by which events must be sharper with another lens than with the stated one for the best to be looked for
+there; they are so by 1.1 where the focal length is wrong by a fifth."""
 
 SMALLEST_TURN = math.radians(0.5)
-"""By how much the camera must turn within a window for another lens to be looked for: without turns it trades with depth,
-and the sharpest one is far off."""
+"""By how much the camera must turn within a window for another lens to be looked for: without turns it trades with
+depth, and the sharpest one is far off."""
 
 SCALE_REACH = 0.06
 """How far from the best scale others count when it is refined."""
@@ -49,8 +58,8 @@ LARGEST_DELAY_ERROR = 3.0
 """Milliseconds of standard error up to which a delay is said to be told."""
 
 LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE = 0.02, 0.1
-"""Standard error up to which the scale of the focal length is said to be told, and the same as a share of how far off it
-is: of another lens, less needs to be known."""
+"""Standard error up to which the scale of the focal length is said to be told, and the same as a share of how far off
+it is: of another lens, less needs to be known."""
 
 FEWEST_SAMPLES = 3
 """Fewest frames, or tiles of windows, from which an error can be estimated."""
@@ -85,6 +94,19 @@ class Estimate:
     """Whether the recording tells it."""
 
 
+@dataclass(frozen=True)
+class CornerFit:
+    """Whether corners of frames go where poses and calibration let them."""
+
+    camera: Camera
+    """Of the frames."""
+    focal_scale: Estimate
+    """Best focal length, as a multiple of the stated one."""
+    miss: float
+    """Median distance of corners from where they can be, pixels; `least_miss` is that with the best focal length."""
+    least_miss: float
+
+
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """What events say about poses, clocks and the focal length."""
@@ -106,6 +128,8 @@ class Agreement:
     """Milliseconds by which frames are stamped later than events of the same instant; None without frames."""
     focal_scale: Estimate
     """Best focal length, as a multiple of the stated one."""
+    corners: CornerFit | None
+    """None without frames in which the same corners are found."""
 
     @classmethod
     def of(cls, recording: EventRecording, depth_range: tuple[float, float] | None) -> Agreement | None:
@@ -146,9 +170,9 @@ class Agreement:
         pose_delay = delay_of(AS_READ, 1.0)
         stated = [Hypothesis(), Hypothesis(round(pose_delay.value * MILLISECOND))]
         other = _other_lens(focus, stated, curve) if focus.turn >= SMALLEST_TURN else None
-        tried_for_all = stated + [other] * (other is not None)
+        tried_for_all = stated if other is None else [*stated, other]
         heights = {
-            reading: float(curve([replace(hypothesis, reading=reading) for hypothesis in tried_for_all]).sum(1).max())
+            reading: float(curve([replace(one, reading=reading) for one in tried_for_all]).sum(1).max())
             for reading in (AS_READ, *READINGS)
         }
         readings, is_clear = _best_readings(recording.trajectory, heights)
@@ -166,8 +190,12 @@ class Agreement:
             plane = edges.best_plane(_coarse(focus.largest_delay))
             early = _delay(lambda delays: edges.likeness(delays, plane), focus.largest_delay)
             frame_delay = Estimate(-early.value, early.error, early.is_told)
+        told = frame_delay is not None and frame_delay.is_told and pose_delay.is_told
+        apart = round((pose_delay.value - frame_delay.value) * MILLISECOND) if told and frame_delay else 0
+        tracks = FrameTracks.of(recording)
+        corners = None if tracks is None else _fit_corners(tracks, near / 2, apart)
         total = {hypothesis: float(curves.sum()) for hypothesis, curves in tried.items()}
-        return cls(focus, edges, plane, total, readings, is_clear, pose_delay, frame_delay, focal_scale)
+        return cls(focus, edges, plane, total, readings, is_clear, pose_delay, frame_delay, focal_scale, corners)
 
     def verdict(self) -> str:
         """What events say about poses, clocks and calibration, in a sentence."""
@@ -178,7 +206,9 @@ class Agreement:
                 ("the clock of the frames", self.frame_delay),
             )
             if delay is not None and not delay.is_told
-        ] + ["the focal length"] * (not self.focal_scale.is_told)
+        ]
+        by_frames = self.corners is not None and self.corners.focal_scale.is_told and self._is_one_camera
+        untold += ["the focal length"] * (not self.focal_scale.is_told and not by_frames)
         found = self.problems()
         if found:
             return found[0].what
@@ -207,6 +237,13 @@ class Agreement:
             if scale.is_told
             else "cannot be told from this recording: where the camera hardly turns, it trades with depth"
         )
+        if self.corners is not None:
+            fit, scale = self.corners, self.corners.focal_scale
+            rows["focal length by frames"] = f"corners are {fit.miss:.2f} pixels off where they can be, " + (
+                f"{fit.least_miss:.2f} with the best, {scale.value:.3f} ± {scale.error:.3f} of the stated one"
+                if scale.is_told
+                else "which does not tell it"
+            )
         rows["sharpness"] = "; ".join(f"{name}: {value}" for name, value in self.shown().items())
         return rows
 
@@ -232,7 +269,8 @@ class Agreement:
                     "Check that the poses are those of this recording, the unit of their times, and the calibration.",
                 )
             ]
-        return [*self._pose_problems(), *self._clock_problems(), *focal]
+        of_frames = [] if focal and self._is_one_camera else self._frame_focal_problems()
+        return [*self._pose_problems(), *self._clock_problems(), *focal, *of_frames]
 
     def _pose_problems(self) -> Iterator[Problem]:
         if AS_READ not in self.readings:
@@ -284,6 +322,23 @@ class Agreement:
                 f"best, {scale.value * self.focus.recording.camera.fx:.1f} pixels.",
                 "Check the calibration, and whether it is of this lens and this resolution of the sensor.",
             )
+
+    def _frame_focal_problems(self) -> Iterator[Problem]:
+        if self.corners is None or AS_READ not in self.readings:
+            return
+        fit, scale = self.corners, self.corners.focal_scale
+        if scale.is_told and abs(scale.value - 1) > max(HARMFUL_SCALE, 3 * scale.error):
+            yield Problem(
+                f"The focal length of the frames is wrong: with {scale.value:.3f} ± {scale.error:.3f} of the stated "
+                f"one, {scale.value * fit.camera.fx:.1f} pixels, corners are {fit.least_miss:.1f} pixels off where the "
+                f"poses let them be, and {fit.miss:.1f} as stated.",
+                "Check the calibration, and whether it is of this lens and the resolution of these frames.",
+            )
+
+    @property
+    def _is_one_camera(self) -> bool:
+        """Whether what frames tell of their camera holds for that of the events."""
+        return self.corners is not None and self.corners.camera == self.focus.recording.camera
 
     def _lateness(self) -> dict[str, float]:
         """By how many milliseconds each clock that is told is late against that of the events."""
@@ -348,6 +403,23 @@ def _other_lens(
     if not is_top or heights[best].max() < LENS_GAIN * curve(stated).sum(1).max():
         return None
     return replace(stated[heights[best].argmax()], focal_scale=lenses[best])
+
+
+def _fit_corners(tracks: FrameTracks, nearest: float, delay: int) -> CornerFit:
+    """The focal length with which corners go where they can.
+
+    Args:
+        tracks: Corners that were followed.
+        nearest: Least depth of the scene, metres.
+        delay: How much later the poses are stamped than frames of the same instant, ns.
+    """
+    fits = np.stack([tracks.fit(nearest, scale, delay) for scale in FRAME_SCALES])
+    found = _estimate(np.log(FRAME_SCALES), fits, SCALE_REACH, math.inf)
+    scale, error = math.exp(found.value), math.exp(found.value) * found.error
+    largest = max(LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE * abs(scale - 1))
+    is_told = found.is_told and error <= largest and fits.mean(1).max() >= SMALLEST_FIT
+    miss, least = (float(np.median(np.concatenate(tracks.misses(nearest, one, delay)))) for one in (1.0, scale))
+    return CornerFit(tracks.frames.camera, Estimate(scale, error, is_told), miss, least)
 
 
 def _estimate(

@@ -164,6 +164,8 @@ def test_a_simulated_recording_is_sound(simulated: EventRecording):
     assert found.pose_delay.is_told and abs(found.pose_delay.value) < 0.5
     assert found.frame_delay is not None and found.frame_delay.is_told and abs(found.frame_delay.value) < 1.0
     assert found.focal_scale.is_told and found.focal_scale.value == pytest.approx(1.0, abs=0.01)
+    assert found.corners is not None and found.corners.focal_scale.is_told
+    assert found.corners.focal_scale.value == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.slow
@@ -195,6 +197,19 @@ def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor
     found = agreement(faults.longer_focal_length(simulated, factor))
     assert found.focal_scale.value == pytest.approx(1 / factor, rel=0.025)
     assert found.problems()[0].what.startswith("The focal length is wrong: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.5])
+def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRecording, factor: float):
+    """Their camera alone is stated wrongly: what events say stays as it is."""
+    wrong = faults.longer_focal_length(simulated, factor)
+    found = agreement(replace(simulated, frames=wrong.frames, blurred_frames=wrong.blurred_frames))
+    assert found.corners is not None and found.corners.focal_scale.is_told
+    assert found.corners.focal_scale.value == pytest.approx(1 / factor, rel=0.01)
+    (problem,) = found.problems()
+    assert problem.what.startswith("The focal length of the frames is wrong: ")
+    assert "corners are" in found.rows()["focal length by frames"]
 
 
 @pytest.fixture(scope="module")
@@ -250,3 +265,4 @@ def test_conventions_of_slider_depth(
 def test_focal_length_of_slider_depth_cannot_be_told(slider: EventRecording, factor: float):
     found = agreement(faults.longer_focal_length(slider, factor))
     assert not found.focal_scale.is_told and "focal length cannot be told" in found.verdict()
+    assert found.corners is not None and not found.corners.focal_scale.is_told
