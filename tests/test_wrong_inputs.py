@@ -2,7 +2,7 @@
 flag, and nothing is changed or left.
 
 What is wrong within the files of a layout is in the tables of the layout's own tests; here, all of it is put into whole
-recordings, with whatever else may become of a file, and the command is run as a person does.
+recordings, with whatever else may become of a file, and the command is run in a process of its own.
 """
 
 from __future__ import annotations
@@ -29,12 +29,8 @@ import test_fuzz
 import test_tum_vie
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
-from test_other_places import within
 
 from enerf_ns.dataparsers.errors import printable
-from enerf_ns.dataparsers.formats.registry import _read_folder
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.scripts.cli import entrypoint
 
 Fault = Callable[[Path], object]
 
@@ -207,21 +203,37 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
+@pytest.fixture(scope="module")
+def forks() -> Iterator[subprocess.Popen[str]]:
+    """The program whose forks are the processes of the commands: each would take seconds to start otherwise."""
+    if not hasattr(os, "fork"):
+        pytest.skip("processes cannot be forked here")
+    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}
+    program = [sys.executable, str(Path(__file__).with_name("forked_commands.py"))]
+    with subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **one_thread}
+    ) as process:
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., str]]:
-    """Calls a command in this process, in its own folder of the test; the sentence that it ends with."""
+def refused(forks: subprocess.Popen[str], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+    """Calls a command in a process of its own, in the folder of the test; the sentence that it ends with."""
 
-    def call(*arguments: object, main: Callable[[], object] = entrypoint) -> str:
-        monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
-        capsys.readouterr()
-        with within(60), pytest.raises(SystemExit) as end:
-            main()
-        assert isinstance(end.value.code, str), "Python prints it to stderr and exits with 1"
-        return check_sentence(f"{capsys.readouterr().err}\n{end.value.code}")
+    def call(*arguments: object) -> str:
+        program, *rest = map(str, arguments)
+        printed = tmp_path_factory.mktemp("printed") / "output"
+        told = {"program": program, "arguments": rest, "folder": os.getcwd(), "environment": dict(os.environ)}
+        assert forks.stdin is not None and forks.stdout is not None
+        forks.stdin.write(json.dumps({**told, "output": str(printed), "limit": 60}) + "\n")
+        forks.stdin.flush()
+        code, output = int(forks.stdout.readline()), printed.read_text(errors="replace")
+        assert code == 1, output
+        return check_sentence(output)
 
-    yield call
-    _read_folder.cache_clear()
-    index_events.cache_clear()
+    return call
 
 
 def output_of(command: str) -> tuple[str, str]:
@@ -236,7 +248,7 @@ def test_a_wrong_input_is_refused_in_one_sentence(name, whole, refused, tmp_path
     monkeypatch.chdir(tmp_path)
     before = tree(tmp_path)
     source = recording / "recording.raw" if wrong.whole == "file" else recording
-    sentence = refused(wrong.command, source, *output_of(wrong.command))
+    sentence = refused("enerf", wrong.command, source, *output_of(wrong.command))
     for part in wrong.said:
         assert part in sentence
     assert str(recording) in sentence
@@ -294,19 +306,15 @@ def home(whole: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.Monke
     return tmp_path
 
 
-def main_of(arguments: tuple[str, ...]) -> Callable[[], object]:
-    if arguments[0] != "enerf":
-        return entrypoint
-    from nerfstudio.scripts.train import entrypoint as train
-
-    return train
+def program_of(arguments: tuple[str, ...]) -> str:
+    return "ns-train" if arguments[0] == "enerf" else "enerf"
 
 
 @pytest.mark.parametrize(("flag", "place"), place_cases())
 def test_a_place_where_nothing_can_be_is_refused(flag: str, place: str, home: Path, refused):
     before = tree(home)
     arguments = tuple(place if argument == "PLACE" else argument for argument in PATH_FLAGS[flag])
-    sentence = refused(*arguments, main=main_of(arguments))
+    sentence = refused(program_of(arguments), *arguments)
     assert printable(place.split("/")[0]) in sentence
     assert tree(home) == before
 
@@ -388,7 +396,7 @@ FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
 def test_a_wrong_flag_is_refused_in_one_sentence(name: str, home: Path, refused):
     arguments, flag = FLAGS[name]
     before = tree(home)
-    sentence = refused(*arguments, main=main_of(arguments))
+    sentence = refused(program_of(arguments), *arguments)
     assert flag.split(".")[-1].removeprefix("--") in sentence
     assert tree(home) == before
 
@@ -419,7 +427,7 @@ def test_nothing_is_written_into_a_recording(command: str, place: str, home: Pat
     (home / "link").symlink_to("recording")
     before = tree(home)
     arguments = tuple(argument.replace("PLACE", place) for argument in INTO[command])
-    sentence = refused(*arguments, main=main_of(arguments))
+    sentence = refused(program_of(arguments), *arguments)
     assert f"lies within the recording {home / 'recording'}" in sentence
     assert tree(home) == before
 
@@ -522,7 +530,7 @@ def test_without_a_home_folder_the_cache_is_done_without(where: str | None, home
 def test_nor_is_the_cache(home: Path, refused, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ENERF_CACHE", "recording/cache")
     before = tree(home)
-    assert "ENERF_CACHE" in refused("inspect", "recording")
+    assert "ENERF_CACHE" in refused("enerf", "inspect", "recording")
     assert tree(home) == before
 
 

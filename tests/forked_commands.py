@@ -1,0 +1,66 @@
+"""Commands in processes of their own, forked from this program, in which all that they import is there already.
+
+Each line that it reads is a command as JSON: `program` (enerf or ns-train), `arguments`, `folder`, `environment`,
+`output` (the file that it prints into) and `limit` (seconds, after which it is killed). It answers each with its exit
+code on a line. A process ends as Python would end it, but for the taking apart of all modules, which takes seconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import os
+import signal
+import sys
+import traceback
+from importlib import import_module
+
+from nerfstudio.scripts import train
+
+from enerf_ns.scripts import cli
+
+MAIN = {"enerf": cli.entrypoint, "ns-train": train.entrypoint}
+
+
+def forked() -> dict:
+    """The next command, in the process that is to run it; ends where there is none."""
+    for line in sys.stdin:
+        command = json.loads(line)
+        number = os.fork()
+        if not number:
+            return command
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(number, signal.SIGKILL))  # noqa: B023
+        signal.alarm(command["limit"])
+        code = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+        signal.alarm(0)
+        print(code, flush=True)
+    sys.exit()
+
+
+if __name__ == "__main__":
+    for name in cli.COMMANDS:
+        import_module(f"enerf_ns.scripts.{name.replace('-', '_')}")
+    gc.freeze()
+    command = forked()
+    output = os.open(command["output"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.chdir(command["folder"])
+    os.environ.clear()
+    os.environ.update(command["environment"])
+    sys.argv = [command["program"], *command["arguments"]]
+    code = 0
+    try:
+        MAIN[command["program"]]()
+    except SystemExit as end:
+        code = 0 if end.code is None else end.code if isinstance(end.code, int) else 1
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    os._exit(code)
