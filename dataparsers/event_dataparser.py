@@ -6,6 +6,7 @@ trainer, models or methods.
 
 from __future__ import annotations
 
+import json
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,7 @@ from tyro.conf import Suppress
 from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
 from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
+from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.picture_files import write_pictures
@@ -152,7 +154,7 @@ class EventDataParser(DataParser):
             camera_type=CameraType.PERSPECTIVE,
             metadata={},
         )
-        return DataparserOutputs(
+        return EventDataparserOutputs(
             image_filenames=list(frames.filenames),
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.from_numpy(box).float()),
@@ -165,6 +167,19 @@ class EventDataParser(DataParser):
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
+
+
+class EventDataparserOutputs(DataparserOutputs):
+    """Those of Nerfstudio, of which files are whole or not there."""
+
+    def save_dataparser_transform(self, path: Path) -> None:
+        """Writes `transform` and `scale`, by which world coordinates become those of the field, as JSON.
+
+        Raises:
+            OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+        """
+        values = {"transform": self.dataparser_transform.tolist(), "scale": float(self.dataparser_scale)}
+        write_whole(path, json.dumps(values, indent=4))
 
 
 def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:

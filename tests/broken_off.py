@@ -147,6 +147,8 @@ class Train(Job):
         if (run / "config.yml").exists():
             assert getattr(read_config(run / "config.yml"), "max_num_iterations") == STEPS  # noqa: B009
             json.loads((run / "choices.json").read_text())
+        if (run / "dataparser_transforms.json").exists():
+            json.loads((run / "dataparser_transforms.json").read_text())
         if (run / "history.jsonl").exists():
             assert len(read_history(run)) >= (run / "history.jsonl").read_bytes().count(b"\n"), (
                 "all that is whole is read"
