@@ -469,6 +469,17 @@ class _Resolver:
             value = f"{what} is {'learned' if kept else f'{given:g}'}" if kept or given else ""
             self.row(part, self.use_events and bool(kept or given), value, why, name)
 
+        name = "model.sensor.second_cutoff_frequency"
+        second = attrgetter(name)(self.config)
+        if second:
+            self.row(
+                "second stage",
+                self.use_events,
+                f"pixels lag by {1e3 / (2 * math.pi * second):.3g} ms more",
+                "set by flag",
+                name,
+            )
+
         name = "model.sensor.response"
         stated = recording.response if self.use_frames else None
         response = self.use(name, lambda: stated or "linlog")

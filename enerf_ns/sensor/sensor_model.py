@@ -63,6 +63,9 @@ class SensorModelConfig:
     learn_cutoff_frequency: Optional[bool] = None  # noqa: UP045
     """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds, and
     pixels are not blind after events, which misleads it."""
+    second_cutoff_frequency: Optional[float] = None  # noqa: UP045
+    """Cut-off frequency (Hz) of a second stage behind the photoreceptor, the same at any brightness. None: there is
+    none."""
     width: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
     """Width of the sensor, pixels."""
     height: tyro.conf.Suppress[Optional[int]] = None  # noqa: UP045
@@ -100,7 +103,10 @@ class SensorModel(nn.Module):
         self.leak_rate: Tensor | float = config.leak_rate
         if config.learn_leak_rate:
             self.leak_rate = nn.Parameter(torch.tensor(float(config.leak_rate)))
-        delay = 1e3 / (2.0 * math.pi * config.cutoff_frequency) if config.cutoff_frequency else 0.0
+        delay, self.second_delay = (
+            1e3 / (2.0 * math.pi * cutoff) if cutoff else 0.0
+            for cutoff in (config.cutoff_frequency, config.second_cutoff_frequency)
+        )
         self.delay: Tensor | float = delay
         if config.learn_cutoff_frequency:
             self.delay = nn.Parameter(torch.tensor(delay))
@@ -178,7 +184,7 @@ class SensorModel(nn.Module):
     @property
     def lags(self) -> bool:
         """Whether pixels follow brightness with a delay."""
-        return isinstance(self.delay, Tensor) or self.delay != 0.0
+        return isinstance(self.delay, Tensor) or self.delay + self.second_delay != 0.0
 
     @property
     def cutoff_frequency(self) -> float:
@@ -192,9 +198,9 @@ class SensorModel(nn.Module):
         """By how much log brightness changed more between two instants than what the pixels compare.
 
         A photoreceptor of first order follows log brightness x as y' = w (x - y), so that x - y = y' / w. Of y, events
-        tell the slope: the rates around the instants. Of a chain of stages the delays 1 / w add up, as far as y' stays
-        the same meanwhile: so one stands for all. The cut-off w grows with brightness as in v2e (Hu, Liu, Delbruck,
-        CVPRW 2021): (255 b + 20) / 275 of that at brightness 1.
+        tell the slope: the rates around the instants. The cut-off w grows with brightness as in v2e (Hu, Liu, Delbruck,
+        CVPRW 2021): (255 b + 20) / 275 of that at brightness 1. The delay 1 / w of a second stage is added, which is
+        exact as far as y' stays the same meanwhile: of y'', rates of events tell less than their noise.
 
         Args:
             start, end: Rendered at the instants.
@@ -206,7 +212,8 @@ class SensorModel(nn.Module):
         lags = []
         for slope, rgb in zip(slopes.unbind(dim=1), (start, end), strict=True):
             share = (255.0 * self.brightness(rgb.detach(), batch.pixels) + 20.0) / 275.0
-            lags.append((1e-3 * self.delay * slope / share).clamp(-LARGEST_LAG, LARGEST_LAG))
+            delay = 1e-3 * (self.delay / share + self.second_delay)
+            lags.append((delay * slope).clamp(-LARGEST_LAG, LARGEST_LAG))
         return lags[1] - lags[0]
 
     @torch.no_grad()

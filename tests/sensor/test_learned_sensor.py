@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.signal
 import torch
 from torch import Tensor
 
@@ -230,6 +231,30 @@ def test_what_a_lag_hides_is_found_from_the_rates_of_events():
         change = brightness_change(*seen(considered, batch), batch, considered)[fired]
         errors[name] = float((change - considered.measured_change(batch)[fired]).square().mean().sqrt()) / 0.2
     assert errors["with"] < 0.1 < 0.4 < errors["without"]
+
+
+def test_a_second_stage_lags_as_well():
+    """Log brightness goes through SciPy's low pass of first order before the slow pixel sees it."""
+    times = np.arange(0, int(SECONDS * 1e9), 200_000)
+    logs = np.log(brightness(torch.arange(PIXELS)[None], torch.from_numpy(times)[:, None]).numpy())
+    low_pass = scipy.signal.bilinear([2 * np.pi * 30.0], [1, 2 * np.pi * 30.0], 1 / 200e-6)
+    passed = logs[0] + scipy.signal.lfilter(*low_pass, logs - logs[0], axis=0)
+    pictures = np.exp(passed).reshape(-1, HEIGHT, WIDTH)
+    settings = SensorSettings(contrast_thresholds=(0.2, 0.2), response=RESPONSE, cutoff_frequency=300.0)
+    camera = EventSensor(settings, pictures[0], 0)
+    parts = [camera.advance(picture, int(time)) for picture, time in zip(pictures[1:], times[1:], strict=True)]
+    parts.append(camera.finish())
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in "xytp")
+    index = EventIndex.from_events(Events(*columns), WIDTH, HEIGHT)
+
+    errors = {}
+    for stages in (1, 2):
+        considered = model(cutoff_frequency=300.0, second_cutoff_frequency=30.0 if stages == 2 else None)
+        batch = Drawn(index, 1).batch(considered)
+        change = brightness_change(*seen(considered, batch), batch, considered) - considered.measured_change(batch)
+        errors[stages] = float(change[batch.fired].square().mean().sqrt()) / 0.2
+    assert errors[2] < 0.1 < 0.2 < errors[1], errors
+    assert model(second_cutoff_frequency=30.0).lags
 
 
 PARTS: dict[str, dict[str, Any]] = {
