@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import signal
 import sys
 from importlib import import_module
 
@@ -48,10 +50,25 @@ def _print_help() -> None:
     print("\nenerf COMMAND --help tells the flags of a command; ns-train enerf trains.")
 
 
+def _imported(name: str) -> type:
+    """The class of a command. A signal ends the program meanwhile: libraries make other errors of a KeyboardInterrupt
+    while they are imported."""
+    before = signal.signal(signal.SIGINT, _stop)
+    try:
+        return getattr(import_module(f"enerf_ns.scripts.{name.replace('-', '_')}"), COMMANDS[name][0])
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _stop(*_: object) -> None:
+    os.write(2, b"enerf: Stopped.\n")
+    os._exit(130)
+
+
 def _run(name: str, arguments: list[str]) -> None:
-    command = getattr(import_module(f"enerf_ns.scripts.{name.replace('-', '_')}"), COMMANDS[name][0])
     try:
         with exit_with_a_sentence():
+            command = _imported(name)
             tyro.cli(command, prog=f"enerf {name}", args=arguments).main()
     except MemoryError as error:
         asked = printable(shlex.join(["enerf", name, *arguments]))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -105,3 +107,21 @@ def test_what_stops_it_from_outside_is_told(error: BaseException, code: object, 
     with pytest.raises(SystemExit) as end:
         cli.entrypoint()
     assert end.value.code == code
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="what a process has loaded is told by Linux")
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("loaded", ["_multiarray_umath", "cv2.abi3"])
+def test_a_signal_while_it_is_imported_is_told_in_a_line(loaded: str, tmp_path: Path):
+    """Sent when this library has just been loaded."""
+    program = Path(sys.executable).with_name("enerf")
+    process = subprocess.Popen(
+        [program, "demo", "--output-dir", tmp_path / "new"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    maps = Path(f"/proc/{process.pid}/maps")
+    while loaded not in maps.read_text() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    told, errors = process.communicate(timeout=100)
+    assert (process.returncode, told, errors) == (130, "", "enerf: Stopped.\n")
+    assert not list(tmp_path.iterdir())
