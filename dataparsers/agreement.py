@@ -396,6 +396,8 @@ def _other_lens(
 ) -> Hypothesis | None:
     """The focal length, far from the stated one, that makes events clearly sharper; None if there is none."""
     lenses = [lens for lens in OTHER_LENSES if focus.allows(lens)]
+    if not lenses:
+        return None
     hypotheses = [replace(hypothesis, focal_scale=lens) for lens in lenses for hypothesis in stated]
     heights = curve(hypotheses).sum(1).reshape(len(lenses), -1)
     best = int(heights.max(1).argmax())
