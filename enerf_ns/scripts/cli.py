@@ -51,13 +51,16 @@ def _print_help() -> None:
 
 
 def _imported(name: str) -> type:
-    """The class of a command. A signal ends the program meanwhile: libraries make other errors of a KeyboardInterrupt
-    while they are imported."""
-    before = signal.signal(signal.SIGINT, _stop)
+    """The class of a command. SIGINT, unless it is ignored, ends the program meanwhile: libraries make other errors of
+    a KeyboardInterrupt while they are imported."""
+    heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if heeded:
+        signal.signal(signal.SIGINT, _stop)
     try:
         return getattr(import_module(f"enerf_ns.scripts.{name.replace('-', '_')}"), COMMANDS[name][0])
     finally:
-        signal.signal(signal.SIGINT, before)
+        if heeded:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _stop(*_: object) -> None:

@@ -116,7 +116,11 @@ def test_a_signal_while_it_is_imported_is_told_in_a_line(loaded: str, tmp_path: 
     """Sent when this library has just been loaded."""
     program = Path(sys.executable).with_name("enerf")
     process = subprocess.Popen(
-        [program, "demo", "--output-dir", tmp_path / "new"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [program, "demo", "--output-dir", tmp_path / "new"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests may run where it is ignored
     )
     maps = Path(f"/proc/{process.pid}/maps")
     while loaded not in maps.read_text() and process.poll() is None:
