@@ -11,12 +11,12 @@ from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.encodings import SHEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.field_components.mlp import MLP
 from nerfstudio.fields.base_field import Field, get_normalized_directions
 from torch import Tensor, nn
 from torch.autograd import Function
 
 from enerf_ns.encodings.hash_grid import HashGrid
+from enerf_ns.network import Network
 from enerf_ns.precision import full_precision, widened
 
 Brightness = Literal["log-sigmoid", "sigmoid", "exponential"]
@@ -110,14 +110,7 @@ class HashDensity(nn.Module):
         # contracted space is twice as wide as what lies within [-1, 1], which keeps its cells
         finest = 2 * max_res if contraction else max_res
         self.grid = HashGrid(num_levels, min_res, finest, log2_table_size, backend=backend)
-        self.network = MLP(
-            in_dim=self.grid.out_dim,
-            num_layers=2,
-            layer_width=hidden_dim,
-            out_dim=1 + num_features,
-            activation=nn.ReLU(),
-            implementation="torch",
-        )
+        self.network = Network(self.grid.out_dim, 2, hidden_dim, 1 + num_features, backend)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
         """Density in 1 / scene unit, and the features."""
@@ -174,14 +167,9 @@ class EnerfField(Field):
         self.geometry = HashDensity(aabb, num_features=num_features, **density)
         self.direction_encoding = SHEncoding(levels=4, implementation="torch") if view_direction else None
         directions = self.direction_encoding.get_out_dim() if self.direction_encoding else 0
-        self.colour_network = MLP(
-            in_dim=directions + num_features,
-            num_layers=3 if view_direction else 2,
-            layer_width=hidden_dim_colour,
-            out_dim=num_channels,
-            activation=nn.ReLU(),
-            implementation="torch",
-        )
+        num_layers = 3 if view_direction else 2
+        backend = self.geometry.grid.backend
+        self.colour_network = Network(directions + num_features, num_layers, hidden_dim_colour, num_channels, backend)
 
     @full_precision  # in bfloat16 density is 0.2 to 1.2 % off, and a change of log brightness 0.3 to 0.7 %
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:

@@ -68,7 +68,7 @@ from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.ranges import check_ranges
 from enerf_ns.tables import choices_table, recording_table
 from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
-from enerf_ns.threads import SharedCores
+from enerf_ns.threads import kernels_alone
 from enerf_ns.throughput import batch_factor
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
@@ -321,7 +321,6 @@ class EnerfTrainer(Trainer):
         self._unsaved = ""  # why the last checkpoint could not be stored
         self._found_wrong: set[str] = set()
         self._handlers: dict[int, Any] = {}
-        self._cores: SharedCores | None = None  # while it trains on them
 
     @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -421,7 +420,6 @@ class EnerfTrainer(Trainer):
             return
         self._handle_signals()
         config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
-        self._cores = SharedCores() if config.machine.device_type == "cpu" else None
         try:
             if is_main_process():
                 self.error_against_time.begin(self._start_step, self._recorded)
@@ -433,17 +431,11 @@ class EnerfTrainer(Trainer):
                 f"{config.method_name} --load-config {quoted(self.base_dir / 'config.yml')}."
             ) from error
         finally:
-            if self._cores:
-                self._cores.give_back()
-                self._cores = None
             config.max_num_iterations = total
             self._restore_signals()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        told = self._cores.look() if self._cores else None
-        if told and is_main_process():
-            say(told)
-        with self.error_against_time.step(step):
+        with self.error_against_time.step(step), kernels_alone():
             results = super().train_iteration(step)
         self._metrics = results[2]
         self._trained = step

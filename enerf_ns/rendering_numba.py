@@ -7,21 +7,20 @@ memory. Samples of several rays go through hash grid and networks in blocks, by 
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.field_components.mlp import MLP
 from nerfstudio.fields.base_field import get_normalized_directions
-from torch import Tensor, nn
+from torch import Tensor
 
-from enerf_ns.compiled import compiled
 from enerf_ns.density_voxels import DensityVoxels
-from enerf_ns.encodings.hash_grid_numba import BLOCK, find_cells, interpolate, new_cells, on_threads
+from enerf_ns.encodings.hash_grid_numba import find_cells, interpolate, new_cells
 from enerf_ns.enerf_field import DARKEST, LARGEST_EXPONENT, EnerfField, HashDensity
+from enerf_ns.network_numba import BLOCK, Layers, layers_of, new_values, pass_through, vectorised
 from enerf_ns.ray_samplers import PairedProposalSampler, PairedSpacedSampler
+from enerf_ns.threads import on_threads
 
 RAYS = 32
 """Rays that go through together."""
@@ -41,15 +40,6 @@ ZERO, QUARTER, HALF, ONE, TWO = np.float32(0), np.float32(0.25), np.float32(0.5)
 ACTIVATIONS = ("sigmoid", "log-sigmoid", "exponential")
 """Numbers, by their place, of what makes brightness, as the kernels know it."""
 
-vectorised = partial(compiled, any_order=True)
-
-
-class Layers(NamedTuple):
-    """A network with ReLU between its layers: weights, each of shape (out, in), and biases."""
-
-    weights: tuple[np.ndarray, ...]
-    biases: tuple[np.ndarray, ...]
-
 
 class Geometry(NamedTuple):
     """A `HashDensity`: the levels of its grid, shape (levels, rows, 2), its network, and the box that it fills."""
@@ -61,48 +51,6 @@ class Geometry(NamedTuple):
     low: np.ndarray
     size: np.ndarray
     contraction: bool
-
-
-@vectorised
-def _layer(weight, bias, inputs, number, outputs):
-    width = weight.shape[1]
-    by_four = width // 4 * 4
-    for j in range(weight.shape[0]):
-        for p in range(number):
-            outputs[j, p] = bias[j]
-        for k in range(0, by_four, 4):
-            w0, w1, w2, w3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
-            for p in range(number):
-                outputs[j, p] += (
-                    w0 * inputs[k, p] + w1 * inputs[k + 1, p] + w2 * inputs[k + 2, p] + w3 * inputs[k + 3, p]
-                )
-        for k in range(by_four, width):
-            w0 = weight[j, k]
-            for p in range(number):
-                outputs[j, p] += w0 * inputs[k, p]
-
-
-@vectorised
-def _room(layers):
-    """Room for a block's inputs, and for what each layer makes of them."""
-    widest = layers.weights[0].shape[1]
-    for i in range(len(layers.weights)):
-        widest = max(widest, layers.weights[i].shape[0])
-    return np.empty((len(layers.weights) + 1, widest, BLOCK), np.float32)
-
-
-@vectorised
-def _network(layers, number, values):
-    """What the last layer makes of the inputs in values[0]."""
-    last = len(layers.weights) - 1
-    for i in range(last + 1):
-        _layer(layers.weights[i], layers.biases[i], values[i], number, values[i + 1])
-        if i < last:
-            for j in range(layers.weights[i].shape[0]):
-                for p in range(number):
-                    value = values[i + 1, j, p]
-                    values[i + 1, j, p] = ZERO if value < 0 else value
-    return values[last + 1]
 
 
 @vectorised
@@ -130,7 +78,7 @@ def _geometry(geometry, points, number, cells, values):
     for level in range(len(geometry.levels)):
         find_cells(points, 0, number, geometry.scalings[level], cells)
         interpolate(cells, number, geometry.levels[level], values[0, 2 * level : 2 * level + 2], 0)
-    outputs = _network(geometry.network, number, values)
+    outputs = pass_through(geometry.network, number, values, len(geometry.network.weights))
     for p in range(number):
         outputs[0, p] = geometry.init_density * np.exp(min(outputs[0, p], HIGHEST)) * inside[p]
     return outputs
@@ -218,7 +166,7 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
     is_piecewise = field.contraction
     rgb, accumulation, depth = pictures
     cells, points = new_cells(), np.empty((3, BLOCK), np.float32)
-    field_values, colour_values = _room(field.network), _room(colour)
+    field_values, colour_values = new_values(field.network), new_values(colour)
     num_features = field.network.weights[-1].shape[0] - 1
     thin = faint / np.float32(num_samples)
     edges = np.empty((RAYS, num_samples + 1), np.float32)
@@ -287,7 +235,7 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
                         colour_values[0, k, p] = encoded[r, k]
                     for k in range(num_features):
                         colour_values[0, encoded.shape[1] + k, p] = features[k, seen[block + p]]
-                outputs = _network(colour, number, colour_values)
+                outputs = pass_through(colour, number, colour_values, len(colour.weights))
                 for p in range(number):
                     r = start + lit[seen[block + p] // samples]
                     for channel in range(rgb.shape[1]):
@@ -300,20 +248,12 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
             num_lit = still_lit
 
 
-def _layers(network: MLP) -> Layers:
-    layers = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
-    return Layers(
-        tuple(layer.weight.detach().numpy() for layer in layers),
-        tuple(layer.bias.detach().numpy() for layer in layers),
-    )
-
-
 def _made_of(density: HashDensity) -> Geometry:
     scalings, low = density.grid.scalings.numpy(), density.aabb[0].numpy()
     levels = density.grid.table.detach().numpy().reshape(len(scalings), -1, 2)
     size, init_density = density.aabb[1].numpy() - low, np.float32(density.init_density)
     return Geometry(
-        levels, scalings, _layers(density.network), init_density, low, size, density.contraction is not None
+        levels, scalings, layers_of(density.network), init_density, low, size, density.contraction is not None
     )
 
 
@@ -352,7 +292,7 @@ def render(
         num_samples = sampler.num_nerf_samples_per_ray
     else:
         num_samples = sampler.num_samples
-    what, colour = _made_of(field.geometry), _layers(field.colour_network)
+    what, colour = _made_of(field.geometry), layers_of(field.colour_network)
     activation = ACTIVATIONS.index(field.brightness)
 
     def task(index: int) -> None:

@@ -1,63 +1,63 @@
-"""Threads on a machine that others use, too.
+"""Threads of the compiled kernels, and of PyTorch beside them.
 
-PyTorch's threads spin while they wait for each other. Where another process has one of their cores, the rest spin for
-as long as it is away, and a step takes ten times as long, for both.
+PyTorch's threads spin for milliseconds after each of their tasks, on the cores that the next task needs: that of a
+kernel, or of another process, which spins in turn. A training step leaves PyTorch one thread, and what takes long to
+the kernels, whose threads wait asleep.
 """
 
 from __future__ import annotations
 
+import functools
 import os
-import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
 
-import psutil
 import torch
 
-EVERY = 3.0
-"""Seconds between two looks at what others do."""
+_of_kernels: int | None = None  # where they are not as many as PyTorch's
 
 
-def threads_beside(others: float, cores: int, most: int) -> int:
-    """Threads that have a core of their own, at least 1.
-
-    Args:
-        others: Cores that other processes keep busy, on average.
-        cores: Of the machine.
-        most: Threads at most.
-    """
-    return max(1, min(most, round(cores - others)))
-
-
-class SharedCores:
-    """Gives PyTorch as many threads as there are cores that others leave free, up to the number that it began with;
-    where OMP_NUM_THREADS says how many, that stands."""
-
-    def __init__(self) -> None:
-        self.most = torch.get_num_threads()
-        self._fixed = self.most == 1 or "OMP_NUM_THREADS" in os.environ
-        self._last = _now()
-
-    def look(self) -> str | None:
-        """Has PyTorch use more or fewer threads, every few seconds; says so in words where that changes something."""
-        if self._fixed or time.perf_counter() - self._last[0] < EVERY:
-            return None
-        before, self._last = self._last, _now()
-        seconds, busy, own = (now - then for now, then in zip(self._last, before, strict=True))
-        others = max(0.0, (busy - own) / seconds)
-        cores = psutil.cpu_count() or self.most
-        threads = threads_beside(others, cores, self.most)
-        if threads == torch.get_num_threads():
-            return None
-        torch.set_num_threads(threads)
-        return f"Others keep {others:.1f} of {cores} cores busy: {threads} of {self.most} threads from now on."
-
-    def give_back(self) -> None:
-        """Has PyTorch use as many threads as it began with."""
-        torch.set_num_threads(self.most)
+@contextmanager
+def kernels_alone() -> Iterator[None]:
+    """Leaves PyTorch one thread, and the kernels as many as it had."""
+    global _of_kernels
+    before = torch.get_num_threads()
+    if _of_kernels is not None or before == 1:
+        yield
+        return
+    _of_kernels = before
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _of_kernels = None
 
 
-def _now() -> tuple[float, float, float]:
-    """A time, the time for which all cores together have been busy by then, and that of this process, in seconds."""
-    machine, own = psutil.cpu_times(), time.process_time()
-    idle = machine.idle + getattr(machine, "iowait", 0.0)
-    counted_twice = getattr(machine, "guest", 0.0) + getattr(machine, "guest_nice", 0.0)
-    return time.perf_counter(), sum(machine) - idle - counted_twice, own
+@functools.cache
+def _helpers(number: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(number, "kernels")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of its parent's threads
+
+
+def on_threads(task: Callable[[int], Any], number: int) -> None:
+    """Calls a task that releases the GIL with 0, 1, … number - 1, on as many threads as PyTorch uses, or did before
+    `kernels_alone`; the calling thread is one of them."""
+    num_threads = min(_of_kernels or torch.get_num_threads(), number)
+    indices = iter(range(number))
+
+    def work() -> None:
+        for index in indices:
+            task(index)
+
+    if num_threads <= 1:
+        return work()
+    helpers = [_helpers(num_threads - 1).submit(work) for _ in range(num_threads - 1)]
+    work()
+    for helper in helpers:
+        helper.result()

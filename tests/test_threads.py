@@ -1,75 +1,78 @@
-"""Threads beside other processes."""
+"""Threads of kernels, and of PyTorch beside them."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import time
+import multiprocessing
+import os
+import threading
+from collections import Counter
+from collections.abc import Iterator
 
-import psutil
 import pytest
 import torch
 
-from enerf_ns import threads
-from enerf_ns.threads import SharedCores, threads_beside
-
-
-@pytest.mark.parametrize(
-    ("others", "cores", "most", "expected"),
-    [
-        (0.0, 2, 2, 2),
-        (0.3, 2, 2, 2),
-        (1.0, 2, 2, 1),
-        (2.0, 2, 2, 1),
-        (30.0, 64, 16, 16),
-        (60.0, 64, 16, 4),
-        (9.0, 8, 8, 1),
-    ],
-)
-def test_threads_are_as_many_as_cores_are_free(others: float, cores: int, most: int, expected: int):
-    assert threads_beside(others, cores, most) == expected
+from enerf_ns.threads import kernels_alone, on_threads
 
 
 @pytest.fixture
-def as_many_threads_as_cores(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(threads, "EVERY", 1.0)
+def three_threads() -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(max(2, psutil.cpu_count() or 2))
+    torch.set_num_threads(3)
     yield
     torch.set_num_threads(before)
 
 
-def test_where_others_keep_all_cores_busy_one_thread_is_left(as_many_threads_as_cores):
-    cores = SharedCores()
-    most = torch.get_num_threads()
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(most)]
-    try:
-        assert cores.look() is None  # too soon
-        time.sleep(2.0)
-        told = cores.look()
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
-    assert torch.get_num_threads() < most
-    assert told is not None and f" of {most} threads" in told
-    cores.give_back()
-    assert torch.get_num_threads() == most
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 50])
+def test_each_task_is_done_once(three_threads, number: int):
+    done: Counter[int] = Counter()
+    on_threads(lambda index: done.update([index]), number)
+    assert done == Counter(range(number))
 
 
-def test_own_work_is_no_others(as_many_threads_as_cores):
-    """What this process does itself is not taken for what others do."""
-    idle = threads._now()
-    until = time.process_time() + 1.0
-    while time.process_time() < until:
-        pass
-    _, busy, own = (now - before for now, before in zip(threads._now(), idle, strict=True))
-    assert own == pytest.approx(1.0, abs=0.1)
-    assert busy >= own - 0.3
+def meeting(parties: int) -> int:
+    """How many threads at a time do tasks: each waits until so many are there."""
+    barrier, threads = threading.Barrier(parties), set()
+
+    def task(index: int) -> None:
+        barrier.wait(timeout=20.0)
+        threads.add(threading.get_ident())
+
+    on_threads(task, parties)
+    return len(threads)
 
 
-def test_a_number_that_is_set_stands(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    monkeypatch.setattr(threads, "EVERY", 0.0)
-    assert SharedCores().look() is None
+def test_tasks_are_done_at_once_the_calling_thread_s_among_them(three_threads):
+    assert meeting(3) == 3
+    tasks = []
+    on_threads(lambda index: tasks.append(threading.get_ident()), 1)
+    assert tasks == [threading.get_ident()]
+
+
+def test_pytorch_has_one_thread_beside_as_many_of_kernels_as_it_had(three_threads):
+    with kernels_alone():
+        assert torch.get_num_threads() == 1
+        with kernels_alone():
+            assert meeting(3) == 3
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3
+    with pytest.raises(ZeroDivisionError), kernels_alone():
+        raise ZeroDivisionError
+    assert torch.get_num_threads() == 3
+
+
+def test_what_a_task_raises_is_raised(three_threads):
+    def task(index: int) -> None:
+        if index == 2:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        on_threads(task, 40)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no process can be forked here")
+def test_a_forked_process_has_threads_of_its_own(three_threads):
+    assert meeting(3) == 3
+    process = multiprocessing.get_context("fork").Process(target=lambda: os._exit(meeting(3)))
+    process.start()
+    process.join(timeout=60.0)
+    assert process.exitcode == 3

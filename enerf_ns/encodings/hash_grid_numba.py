@@ -2,15 +2,11 @@
 
 A level is one thread's: while it works there, the level's rows stay in its cache, and gradients need no atomics and add
 up in the same order whatever the number of threads. Positions go through in blocks, whose corners are found by vector
-instructions before the first row is fetched. The kernels release the GIL and run on plain Python threads, as many as
-PyTorch uses, so that no threading layer of Numba has to get along with OpenMP, forks and the viewer's threads.
+instructions before the first row is fetched. The kernels release the GIL and run on plain Python threads
+(`enerf_ns.threads`), so that no threading layer of Numba has to get along with OpenMP, forks and the viewer's threads.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from enerf_ns.compiled import compiled
+from enerf_ns.threads import on_threads
 
 DEVICE = "cpu"
 """Type of the device whose tensors the kernels take."""
@@ -45,8 +42,10 @@ def find_cells(x, first, number, scaling, cells):
     edges, ends, ways = cells
     # rows are of the low bits of a hash, so that 32 bits, which wrap around, do
     prime1, prime2 = np.uint32(2654435761), np.uint32(805459861)
+    # rows are cut, since where an index might be negative, Numba looks at each, and nothing is vectorised
+    along0, along1, along2 = x[0][first : first + number], x[1][first : first + number], x[2][first : first + number]
     for p in range(number):
-        x0, x1, x2 = x[0, first + p] * scaling, x[1, first + p] * scaling, x[2, first + p] * scaling
+        x0, x1, x2 = along0[p] * scaling, along1[p] * scaling, along2[p] * scaling
         floor0, floor1, floor2 = np.floor(x0), np.floor(x1), np.floor(x2)
         w0, w1, w2 = x0 - floor0, x1 - floor1, x2 - floor2
         low0, low1, low2 = np.int32(floor0), np.int32(floor1), np.int32(floor2)
@@ -84,6 +83,7 @@ def interpolate(cells, number, table, encoding, first):
         encoding, first: Shape (2, positions), written from this column on.
     """
     mask = np.uint32(len(table) - 1)
+    encoding0, encoding1 = encoding[0][first : first + number], encoding[1][first : first + number]
     for p in range(number):
         edges, (low, high), (v0, w0), _, _ = _corners(cells, p)
         sum0 = sum1 = np.float32(0)
@@ -92,7 +92,7 @@ def interpolate(cells, number, table, encoding, first):
             weight_a, weight_b = weight * v0, weight * w0
             sum0 += weight_a * table[a, 0] + weight_b * table[b, 0]
             sum1 += weight_a * table[a, 1] + weight_b * table[b, 1]
-        encoding[0, first + p], encoding[1, first + p] = sum0, sum1
+        encoding0[p], encoding1[p] = sum0, sum1
 
 
 @compiled
@@ -112,9 +112,10 @@ def _backward_table(x, grad_encoding, scaling, grad_table):
     for first in range(0, x.shape[1], BLOCK):
         number = min(BLOCK, x.shape[1] - first)
         find_cells(x, first, number, scaling, cells)
+        grads0, grads1 = grad_encoding[0][first : first + number], grad_encoding[1][first : first + number]
         for p in range(number):
             edges, (low, high), (v0, w0), _, _ = _corners(cells, p)
-            grad0, grad1 = grad_encoding[0, first + p], grad_encoding[1, first + p]
+            grad0, grad1 = grads0[p], grads1[p]
             for edge, weight in edges:
                 a, b = (low ^ edge) & mask, (high ^ edge) & mask
                 weight_a, weight_b = weight * v0, weight * w0
@@ -131,9 +132,10 @@ def _backward_x(x, grad_encoding, scaling, table, grad_x):
     for first in range(0, x.shape[1], BLOCK):
         number = min(BLOCK, x.shape[1] - first)
         find_cells(x, first, number, scaling, cells)
+        grads0, grads1 = grad_encoding[0][first : first + number], grad_encoding[1][first : first + number]
         for p in range(number):
             edges, (low, high), (v0, w0), (v1, w1), (v2, w2) = _corners(cells, p)
-            grad0, grad1 = grad_encoding[0, first + p], grad_encoding[1, first + p]
+            grad0, grad1 = grads0[p], grads1[p]
             along0 = np.float32(0)
             values = (np.float32(0), np.float32(0), np.float32(0), np.float32(0))  # of the last 4 edges
             for edge, weight in edges:
@@ -145,17 +147,6 @@ def _backward_x(x, grad_encoding, scaling, table, grad_x):
             grad_x[0, first + p] = scaling * along0
             grad_x[1, first + p] = scaling * (v2 * (values[2] - values[0]) + w2 * (values[3] - values[1]))
             grad_x[2, first + p] = scaling * (v1 * (values[1] - values[0]) + w1 * (values[3] - values[2]))
-
-
-def on_threads(task: Callable[[int], Any], number: int) -> None:
-    """Calls a task that releases the GIL with 0, 1, … number - 1, on as many threads as PyTorch uses."""
-    num_threads = min(torch.get_num_threads(), number)
-    if num_threads <= 1:
-        for index in range(number):
-            task(index)
-    else:
-        with ThreadPoolExecutor(num_threads) as pool:
-            list(pool.map(task, range(number)))
 
 
 def _read_into_cache(table: np.ndarray, num_positions: int) -> None:
