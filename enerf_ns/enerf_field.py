@@ -114,7 +114,9 @@ class HashDensity(nn.Module):
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
         """Density in 1 / scene unit, and the features."""
-        unit = self.unit(positions)
+        # coordinate by coordinate in memory, as the kernels take them: what follows is vectorised
+        rows = positions.reshape(-1, 3).t().contiguous()
+        unit = self.unit(rows.t().view(positions.shape))
         density, features = self.at(unit.clamp(0.0, 1.0))
         if self.contraction is None:
             density = density * ((unit > 0.0) & (unit < 1.0)).all(dim=-1, keepdim=True)
@@ -130,8 +132,10 @@ class HashDensity(nn.Module):
         """Density in 1 / scene unit, and the features, at positions of `unit` in [0, 1], faces of the box included."""
         # rows of a matrix: where there are more axes, PyTorch multiplies in another way, which is slower
         output = self.network(self.grid(unit.reshape(-1, 3)))
-        output = output.view(*unit.shape[:-1], output.shape[-1])
-        return self.init_density * limited_exp(widened(output[..., :1])), output[..., 1:]
+        # features first, as the kernels have them, so that gradients are put together without moving them around
+        parts = output.t().split_with_sizes([1, output.shape[1] - 1])
+        density, features = (part.t().view(*unit.shape[:-1], len(part)) for part in parts)
+        return self.init_density * limited_exp(widened(density)), features
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
         """Density alone."""

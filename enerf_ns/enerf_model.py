@@ -13,7 +13,7 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.losses import interlevel_loss, ray_samples_to_sdist
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -34,7 +34,7 @@ from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.balance import FrameBalance
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
-from enerf_ns.supervision.losses import frame_loss
+from enerf_ns.supervision.losses import distortion_loss, frame_loss
 
 FAINT = 5e-4
 """Share of a ray's light that a picture may miss for what lies behind, and as much for what is thin."""
@@ -419,7 +419,8 @@ class EnerfModel(Model):
             if config.opacity_loss_weight:
                 losses["opacity_loss"] = config.opacity_loss_weight * (1.0 - outputs["accumulation"]).mean()
             if config.distortion_loss_weight:
-                losses["distortion_loss"] = config.distortion_loss_weight * distortion_loss(weights, samples)
+                spread = distortion_loss(weights[-1][..., 0], ray_samples_to_sdist(samples[-1]))
+                losses["distortion_loss"] = config.distortion_loss_weight * spread
             if self.proposal is not None:
                 losses["interlevel_loss"] = config.interlevel_loss_weight * interlevel_loss(weights, samples)
         return losses

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
+from nerfstudio.model_components.losses import interlevel_loss, ray_samples_to_sdist
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.enerf_model import MEAN_BRIGHTNESS
@@ -17,6 +17,7 @@ from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
 from enerf_ns.supervision.balance import FrameBalance
+from enerf_ns.supervision.losses import distortion_loss
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +123,7 @@ def test_all_is_finite_for_any_ray_and_density(pipeline: Any, training: bool, lo
         losses = [
             (outputs["rgb"] ** 2).mean(),
             (1.0 - outputs["accumulation"]).mean(),
-            distortion_loss(outputs["weights_list"], outputs["ray_samples_list"]),
+            distortion_loss(outputs["weights_list"][-1][..., 0], ray_samples_to_sdist(outputs["ray_samples_list"][-1])),
             interlevel_loss(outputs["weights_list"], outputs["ray_samples_list"]),
         ]
         assert all(loss.isfinite() for loss in losses)

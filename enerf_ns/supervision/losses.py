@@ -88,3 +88,22 @@ def frame_loss(rendered: Float[Tensor, "rays 3"], recorded: Float[Tensor, "rays 
     if grey:
         rendered, recorded = luma(rendered)[..., None], luma(recorded)[..., None]
     return torch.mean((rendered - recorded) ** 2)
+
+
+@full_precision
+def distortion_loss(
+    weights: Float[Tensor, "rays samples"], edges: Float[Tensor, "rays samples+1"]
+) -> Float[Tensor, ""]:
+    """How far apart a ray's light comes from (mip-NeRF 360, Barron et al., CVPR 2022, equation 15), in one pass along
+    the ray: what lies before a sample is summed up by then (Sun et al., Improved Direct Voxel Grid Optimization, 2022).
+
+    Args:
+        weights: Of the samples of each ray.
+        edges: Where they begin and end, in ascending order, as shares of the ray.
+    """
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2.0
+    before = weights.cumsum(dim=-1) - weights
+    moment_before = (weights * middles).cumsum(dim=-1) - weights * middles
+    between = 2.0 * weights * (middles * before - moment_before)
+    within = weights.square() * (edges[:, 1:] - edges[:, :-1]) / 3.0
+    return (between + within).sum(dim=-1).mean()

@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from nerfstudio.model_components.losses import lossfun_distortion
 
 from enerf_ns.supervision.losses import (
+    distortion_loss,
     frame_loss,
     huber_event_loss,
     no_event_loss,
@@ -101,3 +103,27 @@ def test_what_a_frame_shows_as_white_may_be_any_brighter(grey: bool):
     assert frame_loss(torch.full((1, 3), 40.0), white, grey).item() == pytest.approx(0.0, abs=1e-12)
     assert frame_loss(torch.full((1, 3), 0.5), white, grey).item() == pytest.approx(0.25)
     assert frame_loss(torch.full((1, 3), 40.0), darker, grey).item() == pytest.approx(39.5**2)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 24, 300])
+def test_distortion_loss_is_nerfstudio_s_sum_over_all_pairs(samples: int):
+    generator = torch.Generator().manual_seed(samples)
+    weights = torch.rand(40, samples, generator=generator, dtype=torch.float64) ** 4
+    edges = torch.rand(40, samples + 1, generator=generator, dtype=torch.float64).sort(dim=-1).values
+    weights[1], weights[2] = 0.0, 1.0
+    weights[3, 0] = 0.0
+    found, expected = [], []
+    for loss, results in ((distortion_loss, found), (lambda w, t: lossfun_distortion(t, w).mean(), expected)):
+        leaves = [weights.clone().requires_grad_(), edges.clone().requires_grad_()]
+        value = loss(*leaves)
+        results += [value, *torch.autograd.grad(value, leaves)]
+    for value, true in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, true, rtol=1e-9, atol=1e-12)
+
+
+def test_distortion_of_one_place_far_along_the_ray_is_none():
+    """In float32 what is summed up cancels to a ten-millionth of the ray."""
+    edges = torch.linspace(0.0, 1.0, 25).repeat(8, 1)
+    weights = torch.zeros(8, 24)
+    weights[:, 20] = 1.0
+    assert distortion_loss(weights, edges).item() == pytest.approx(1 / 24 / 3, rel=1e-5)
