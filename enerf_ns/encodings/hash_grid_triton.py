@@ -41,6 +41,16 @@ def _cell(x, positions, inside, scaling):
 
 
 @triton.jit
+def _corner(corner: tl.constexpr, low0, high0, w0, low1, high1, w1, low2, high2, w2, table_size):
+    """Rows of one of the corners of cells, of 0 to 7, among those of a level, and its weights along the three axes."""
+    hash0, weight0 = (high0, w0) if corner & 1 else (low0, 1.0 - w0)
+    hash1, weight1 = (high1, w1) if corner & 2 else (low1, 1.0 - w1)
+    hash2, weight2 = (high2, w2) if corner & 4 else (low2, 1.0 - w2)
+    rows = ((hash0 ^ hash1 ^ hash2) & (table_size - 1)).to(tl.int64)
+    return rows, weight0, weight1, weight2
+
+
+@triton.jit
 def _forward(
     x, table, scalings, encoding, num_positions, table_size, step, FEATURES: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -51,10 +61,8 @@ def _forward(
     low0, high0, w0, low1, high1, w1, low2, high2, w2 = _cell(x, positions, inside, tl.load(scalings + level))
     total = tl.zeros((BLOCK, FEATURES), tl.float32)
     for corner in tl.static_range(8):
-        hash0, weight0 = (high0, w0) if corner & 1 else (low0, 1.0 - w0)
-        hash1, weight1 = (high1, w1) if corner & 2 else (low1, 1.0 - w1)
-        hash2, weight2 = (high2, w2) if corner & 4 else (low2, 1.0 - w2)
-        rows = ((hash0 ^ hash1 ^ hash2) & (table_size - 1)).to(tl.int64) + level.to(tl.int64) * table_size
+        rows, weight0, weight1, weight2 = _corner(corner, low0, high0, w0, low1, high1, w1, low2, high2, w2, table_size)
+        rows += level.to(tl.int64) * table_size
         values = tl.load(table + rows[:, None] * FEATURES + features, mask=inside[:, None], other=0.0)
         total += (weight0 * weight1 * weight2)[:, None] * values
     tl.store(encoding + (level * FEATURES + features) * step + positions[:, None], total, mask=inside[:, None])
@@ -81,10 +89,8 @@ def _backward_table(
     at = positions[:, None] * step_position + (level * FEATURES + features) * step_feature
     grad = tl.load(grad_encoding + at, mask=inside[:, None], other=0.0)
     for corner in tl.static_range(8):
-        hash0, weight0 = (high0, w0) if corner & 1 else (low0, 1.0 - w0)
-        hash1, weight1 = (high1, w1) if corner & 2 else (low1, 1.0 - w1)
-        hash2, weight2 = (high2, w2) if corner & 4 else (low2, 1.0 - w2)
-        rows = ((hash0 ^ hash1 ^ hash2) & (table_size - 1)).to(tl.int64) + level.to(tl.int64) * table_size
+        rows, weight0, weight1, weight2 = _corner(corner, low0, high0, w0, low1, high1, w1, low2, high2, w2, table_size)
+        rows += level.to(tl.int64) * table_size
         values = (weight0 * weight1 * weight2)[:, None] * grad
         tl.atomic_add(grad_table + rows[:, None] * FEATURES + features, values, mask=inside[:, None], sem="relaxed")
 
@@ -116,15 +122,15 @@ def _backward_x(
         at = positions[:, None] * step_position + (level * FEATURES + features) * step_feature
         grad = tl.load(grad_encoding + at, mask=inside[:, None], other=0.0)
         for corner in tl.static_range(8):
-            hash0, weight0, sign0 = (high0, w0, 1.0) if corner & 1 else (low0, 1.0 - w0, -1.0)
-            hash1, weight1, sign1 = (high1, w1, 1.0) if corner & 2 else (low1, 1.0 - w1, -1.0)
-            hash2, weight2, sign2 = (high2, w2, 1.0) if corner & 4 else (low2, 1.0 - w2, -1.0)
-            rows = ((hash0 ^ hash1 ^ hash2) & (table_size - 1)).to(tl.int64) + level * table_size
+            rows, weight0, weight1, weight2 = _corner(
+                corner, low0, high0, w0, low1, high1, w1, low2, high2, w2, table_size
+            )
+            rows += level * table_size
             values = tl.load(table + rows[:, None] * FEATURES + features, mask=inside[:, None], other=0.0)
             value = scaling * tl.sum(grad * values, axis=1)
-            along0 += sign0 * weight1 * weight2 * value
-            along1 += sign1 * weight0 * weight2 * value
-            along2 += sign2 * weight0 * weight1 * value
+            along0 += (1.0 if corner & 1 else -1.0) * weight1 * weight2 * value
+            along1 += (1.0 if corner & 2 else -1.0) * weight0 * weight2 * value
+            along2 += (1.0 if corner & 4 else -1.0) * weight0 * weight1 * value
     tl.store(grad_x + 3 * positions, along0, mask=inside)
     tl.store(grad_x + 3 * positions + 1, along1, mask=inside)
     tl.store(grad_x + 3 * positions + 2, along2, mask=inside)
