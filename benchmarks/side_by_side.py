@@ -1,7 +1,7 @@
 """Two trainings at a time on one machine: the share of its speed that each keeps.
 
-Trains on the simulated demo, alone and then twice at once, each time for some seconds after those in which it finds out
-what others do, and prints steps a second and their ratio, and the same of threads that never give way.
+Trains on the simulated demo, alone and then twice at once, each time for some seconds after the first, and prints
+steps a second and their ratio.
 
     python benchmarks/side_by_side.py
 """
@@ -21,17 +21,15 @@ import torch
 from enerf_ns.evaluation.runs import method_config, set_up
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
-from enerf_ns.threads import SharedCores
 
-SETTLING, TIMED = 12.0, 15.0
+SETTLING, TIMED = 10.0, 15.0
 """Seconds of training that are left out, and that are timed."""
 
 
-def steps_a_second(recording: Path, folder: Path, gives_way: bool) -> float:
+def steps_a_second(recording: Path, folder: Path) -> float:
     """Of a training on all cores."""
     config = method_config("enerf", recording, folder, {"evaluation_share": 0.0, "machine.device_type": "cpu"})
     trainer = set_up(config)
-    trainer._cores = SharedCores() if gives_way else None
     trainer.pipeline.train()
     start, steps, first = time.perf_counter(), 0, 0.0
     while (now := time.perf_counter() - start) < SETTLING + TIMED:
@@ -43,9 +41,9 @@ def steps_a_second(recording: Path, folder: Path, gives_way: bool) -> float:
     return steps / (time.perf_counter() - start - first)
 
 
-def at_once(number: int, recording: Path, folder: Path, gives_way: bool) -> list[float]:
+def at_once(number: int, recording: Path, folder: Path) -> list[float]:
     """Steps a second of so many trainings."""
-    command = [sys.executable, __file__, str(recording), str(folder), str(int(gives_way))]
+    command = [sys.executable, __file__, str(recording), str(folder)]
     running = [
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(number)
     ]
@@ -58,18 +56,17 @@ def main() -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             simulate(SimulationSettings("shapes"), recording)
         print(f"PyTorch {torch.__version__}, CPU, {torch.get_num_threads()} threads\n")
-        print("| threads | alone, steps a second | of two at once, each | share kept |\n| --- | --- | --- | --- |")
-        for name, gives_way in (("give way", True), ("stay", False)):
-            (alone,) = at_once(1, recording, Path(temporary) / f"{name}-alone", gives_way)
-            both = at_once(2, recording, Path(temporary) / f"{name}-both", gives_way)
-            shares = ", ".join(f"{speed / alone:.2f}" for speed in both)
-            print(f"| {name} | {alone:.2f} | {', '.join(f'{speed:.2f}' for speed in both)} | {shares} |", flush=True)
+        print("| alone, steps a second | of two at once, each | share kept |\n| --- | --- | --- |")
+        (alone,) = at_once(1, recording, Path(temporary) / "alone")
+        both = at_once(2, recording, Path(temporary) / "both")
+        shares = ", ".join(f"{speed / alone:.2f}" for speed in both)
+        print(f"| {alone:.2f} | {', '.join(f'{speed:.2f}' for speed in both)} | {shares} |")
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         with contextlib.redirect_stdout(sys.stderr):
-            speed = steps_a_second(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] == "1")
+            speed = steps_a_second(Path(sys.argv[1]), Path(sys.argv[2]))
         print(speed)
     else:
         main()
