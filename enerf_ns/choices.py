@@ -450,9 +450,10 @@ class _Resolver:
         self.row("threshold map", kept, value, self.why(name, why), name)
 
         lag_hides = blind and "pixels that are blind after events miss what would tell how far they lag"
-        for part, setting, what, unit, hidden in (
-            ("leak", "leak_rate", "what the memory of pixels loses by itself", "on events a second", ""),
-            ("bandwidth", "cutoff_frequency", "how far pixels lag behind brightness", "ms", lag_hides or ""),
+        leaks, lags = "what the memory of pixels loses by itself", "how far pixels lag behind brightness"
+        for part, setting, what, stated, unit, hidden in (
+            ("leak", "leak_rate", leaks, "{:g} on events a second", "on events a second", ""),
+            ("bandwidth", "cutoff_frequency", lags, "cut off at {:g} Hz", "ms", lag_hides or ""),
         ):
             name = f"model.sensor.learn_{setting}"
             given = attrgetter(f"model.sensor.{setting}")(self.config)
@@ -466,7 +467,7 @@ class _Resolver:
                     hidden or f"the sensor is unknown, and {len(index):,} events tell it within {error:.2g} {unit}{few}"
                 )
             why = "set by flag" if given else self.why(name, why)
-            value = f"{what} is {'learned' if kept else f'{given:g}'}" if kept or given else ""
+            value = f"{what} is learned" if kept else stated.format(given) if given else ""
             self.row(part, self.use_events and bool(kept or given), value, why, name)
 
         name = "model.sensor.second_cutoff_frequency"

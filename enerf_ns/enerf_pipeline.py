@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
+from jaxtyping import Float
 from nerfstudio.models.base_model import Model
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -25,7 +26,7 @@ from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
 from enerf_ns.evaluation.protocols import described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
-from enerf_ns.events.batch import TrainBatch
+from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.seen_volume import SeenVolume
@@ -35,6 +36,15 @@ from enerf_ns.terminal import say
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer_elements import ViewerControl
+
+SLOPE_PAIRS = 64
+"""Pairs of a step of which slopes of brightness are rendered: enough to learn one number from."""
+
+SLOPES_EVERY = 4
+"""Steps from one of which slopes are rendered to the next."""
+
+SLOPE_NS = 1_000_000
+"""Time (ns) before and after an instant between which the slope of brightness is rendered."""
 
 
 @dataclass
@@ -172,6 +182,9 @@ class EnerfPipeline(VanillaPipeline):
         rays = self.datamanager.rays(batch, sensor)
         self.stopwatch.lap("rays")
         outputs = self._model(rays)
+        if self.training and batch.events is not None and sensor.learns_lag:
+            slopes = self._slopes(batch.events, SLOPE_PAIRS if step % SLOPES_EVERY == 0 else 0)
+            batch = replace(batch, events=replace(batch.events, slopes=slopes))
         self.stopwatch.lap("render")
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)
@@ -179,6 +192,27 @@ class EnerfPipeline(VanillaPipeline):
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
         self.stopwatch.lap("losses")
         return outputs, losses, metrics
+
+    @torch.no_grad()
+    def _slopes(self, batch: EventBatch, number: int) -> Float[Tensor, "pairs 2"]:
+        """By how much rendered log brightness changes a second around both instants of the first pairs of events, up to
+        a number; 0 of the others."""
+        manager, sensor = self.datamanager, self.model.sensor
+        number = min(number, len(batch) - batch.num_silent)
+        found = torch.zeros(len(batch), 2, device=batch.start.device)
+        if number == 0:
+            return found
+        instants = torch.cat([batch.start[:number], batch.end[:number]])
+        trajectory = manager.event_camera.trajectory
+        before = (instants - SLOPE_NS).clamp(min=trajectory.start)
+        after = (instants + SLOPE_NS).clamp(max=trajectory.end)
+        none = torch.zeros_like(instants)
+        around = EventBatch(batch.pixels[:number].repeat(2), before, after, none, none, starts_at_events=False)
+        seen = self.model.get_outputs(manager.rays(TrainBatch(around, None), sensor))["rgb"]
+        first, second = seen.chunk(2)
+        slopes = brightness_change(first, second, around, sensor) / (1e-9 * (after - before)).float()
+        found[:number] = slopes.view(2, number).t()
+        return found
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch, as of `get_train_loss_dict` but rendered as in evaluation."""

@@ -277,6 +277,29 @@ def test_a_flag_stands_and_is_said_to(recording: Path, tmp_path: Path, setting: 
     assert rows(resolution)[part].why == "set by flag"
 
 
+@pytest.mark.parametrize(
+    ("setting", "part", "value"),
+    [
+        ({"leak_rate": 0.5}, "leak", "0.5 on events a second"),
+        ({"cutoff_frequency": 100.0}, "bandwidth", "cut off at 100 Hz"),
+        (
+            {"cutoff_frequency": 100.0, "learn_cutoff_frequency": True},
+            "bandwidth",
+            "how far pixels lag behind brightness is learned",
+        ),
+        ({"second_cutoff_frequency": 200.0}, "second stage", "pixels lag by 0.796 ms more"),
+    ],
+)
+def test_what_is_stated_of_noise_and_lag_is_shown_with_its_unit(
+    recording: Path, tmp_path: Path, setting: dict[str, Any], part: str, value: str
+):
+    config = small_config(recording, tmp_path, **{f"sensor__{name}": given for name, given in setting.items()})
+    rows = {choice.part: choice for choice in config.resolved().pipeline.resolution.choices}
+    assert rows[part].kept and (rows[part].value, rows[part].why) == (value, "set by flag")
+    others = {"leak", "bandwidth", "second stage"} - {part}
+    assert not any(rows[other].kept for other in others & rows.keys())
+
+
 def test_what_is_applied_fills_in_what_is_open_and_leaves_the_config_alone(recording: Path):
     config = copy.deepcopy(ENERF)
     config.model.max_res, config.datamanager.silent_pairs = 77, 0

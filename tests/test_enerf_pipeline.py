@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 
+from enerf_ns.enerf_pipeline import SLOPE_NS, SLOPE_PAIRS
 from enerf_ns.sensor.response import Logarithm, luma
 
 
@@ -53,6 +55,32 @@ def test_the_scores_of_events_are_those_of_what_is_rendered(pipeline: Any):
     assert found["event_rmse"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)
     agrees = [a * b > 0 for a, b in zip(change, measured, strict=True) if b != 0]
     assert 0 < len(agrees) and found["event_sign"] == sum(agrees) / len(agrees)
+
+
+def test_slopes_are_those_of_what_is_rendered(pipeline: Any):
+    """Of the first pairs, from a moment before to a moment after each instant, as far as there are poses."""
+    manager, sensor = pipeline.datamanager, pipeline.model.sensor
+    torch.nn.init.normal_(pipeline.model.field.geometry.grid.table)
+    trajectory = manager.event_camera.trajectory
+    batch = manager.next_batch(sensor).events
+    start = batch.start.clone()
+    start[0] = trajectory.start
+    batch = replace(batch, start=start)
+    number = min(SLOPE_PAIRS, len(batch) - batch.num_silent)
+    pipeline.eval()
+    found = pipeline._slopes(batch, SLOPE_PAIRS)
+    assert found.shape == (len(batch), 2) and not found.requires_grad and (found[number:] == 0.0).all()
+    for instant, times in enumerate((batch.start, batch.end)):
+        levels, moments = [], []
+        for moment in (times - SLOPE_NS, times + SLOPE_NS):
+            moments.append(moment[:number].clamp(trajectory.start, trajectory.end))
+            with torch.no_grad():
+                rgb = pipeline.model(manager.event_camera.rays(batch.pixels[:number], moments[-1]))["rgb"]
+            levels.append(sensor.log_brightness(rgb, batch.pixels[:number]))
+        expected = (levels[1] - levels[0]) / (1e-9 * (moments[1] - moments[0]))
+        assert expected.abs().max() > 1.0
+        torch.testing.assert_close(found[:number, instant], expected.float(), rtol=1e-3, atol=1e-2)
+    pipeline.train()
 
 
 def test_the_config_of_a_pipeline_has_nothing_open_and_the_users_is_as_it_was(recording: Path, tmp_path: Path):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
@@ -125,3 +126,19 @@ def test_the_tables_name_what_there_is(recording: Path, tmp_path: Path):
     text = captured.get()
     for expected in ("32 x 24, pinhole", "11, 32 x 24, with depth", "blurred frames", "kept", "left out"):
         assert expected in text
+
+
+def test_a_run_is_the_same_on_any_number_of_threads(recording: Path, tmp_path: Path):
+    before, parameters = torch.get_num_threads(), []
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            config = small_config(recording, tmp_path / str(number), data__event_pairs=2000)
+            trainer = set_up(config)
+            trainer.pipeline.train()
+            for step in range(3):
+                trainer.train_iteration(step)
+            parameters.append(trainer.pipeline.model.state_dict())
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(parameters[0][name], value) for name, value in parameters[1].items())

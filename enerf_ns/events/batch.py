@@ -30,6 +30,9 @@ class EventBatch:
     rates: Float[Tensor, "pairs 2 2"] | None = None
     """Events a second around the first and the second instant of each pair, on and off (`samplers.rates_around`); None
     where nobody needs them."""
+    slopes: Float[Tensor, "pairs 2"] | None = None
+    """By how much rendered log brightness changes a second at either instant, of the first pairs; 0 of the others. None
+    where nobody needs it."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -60,8 +63,10 @@ class EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
         num_silent = int(chosen[self.silent].sum())
-        rates = None if self.rates is None else self.rates[chosen]
-        return EventBatch(*columns, num_silent=num_silent, starts_at_events=self.starts_at_events, rates=rates)
+        rates, slopes = (None if column is None else column[chosen] for column in (self.rates, self.slopes))
+        return EventBatch(
+            *columns, num_silent=num_silent, starts_at_events=self.starts_at_events, rates=rates, slopes=slopes
+        )
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,11 @@ class SensorModel(nn.Module):
         return isinstance(self.delay, Tensor) or self.delay + self.second_delay != 0.0
 
     @property
+    def learns_lag(self) -> bool:
+        """Whether the delay of the photoreceptor is learned, best from batches with `slopes`."""
+        return isinstance(self.delay, nn.Parameter)
+
+    @property
     def cutoff_frequency(self) -> float:
         """Cut-off frequency (Hz) of the photoreceptor at brightness 1; infinite where pixels do not lag."""
         delay = float(self.delay)
@@ -202,6 +207,11 @@ class SensorModel(nn.Module):
         CVPRW 2021): (255 b + 20) / 275 of that at brightness 1. The delay 1 / w of a second stage is added, which is
         exact as far as y' stays the same meanwhile: of y'', rates of events tell less than their noise.
 
+        Where the delay is learned and the batch has `slopes`, these take the place of y' in its gradient. A field that
+        learns from pixels with too short a delay is blurred, and hides the lag that it did not see; and noise of the
+        rates speaks for shorter delays, which let less of it in. Rendered slopes are as blurred as the field and know
+        nothing of that noise: they are the instrument, in the sense of statistics, of the rates.
+
         Args:
             start, end: Rendered at the instants.
             batch: With `rates`.
@@ -210,10 +220,16 @@ class SensorModel(nn.Module):
         c_on, c_off = self.contrast_thresholds
         slopes = c_on * batch.rates[..., 0] - c_off * batch.rates[..., 1]
         lags = []
-        for slope, rgb in zip(slopes.unbind(dim=1), (start, end), strict=True):
+        for instant, rgb in enumerate((start, end)):
+            slope = slopes[:, instant]
             share = (255.0 * self.brightness(rgb.detach(), batch.pixels) + 20.0) / 275.0
-            delay = 1e-3 * (self.delay / share + self.second_delay)
-            lags.append((delay * slope).clamp(-LARGEST_LAG, LARGEST_LAG))
+            if batch.slopes is None or not self.learns_lag:
+                lag = (self.delay / share + self.second_delay) * slope
+            else:
+                delay = torch.as_tensor(self.delay)
+                lag = (delay.detach() / share + self.second_delay) * slope
+                lag = lag + (delay - delay.detach()) / share * batch.slopes[:, instant]  # 0, with a gradient
+            lags.append((1e-3 * lag).clamp(-LARGEST_LAG, LARGEST_LAG))
         return lags[1] - lags[0]
 
     @torch.no_grad()

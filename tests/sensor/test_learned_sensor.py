@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -89,14 +90,21 @@ class Drawn:
         return pairs.with_silent(self._silent.sample(128, self._generator, sensor.refractory_period))
 
 
-def learn(sensor: SensorModel, index: EventIndex, steps: int = 600, mode: Any = "successor") -> SensorModel:
-    """Trains the sensor alone, with the learning rates of the method, which fall to a tenth."""
+def learn(
+    sensor: SensorModel,
+    index: EventIndex,
+    steps: int = 600,
+    mode: Any = "successor",
+    told: Callable[[EventBatch], EventBatch] = lambda batch: batch,
+) -> SensorModel:
+    """Trains the sensor alone, with the learning rates of the method, which fall to a tenth; told makes of a batch what
+    it is told of it."""
     groups = [{"params": group, "lr": SENSOR_LEARNING_RATES[name]} for name, group in sensor.get_param_groups().items()]
     adam = torch.optim.Adam(groups) if groups else None
     drawn = Drawn(index, 0, mode)
     supervision = EventSupervision("huber", 1.0, 0.1, 0.0)
     for step in range(steps):
-        batch = drawn.batch(sensor)
+        batch = told(drawn.batch(sensor))
         start, end = seen(sensor, batch)
         sensor.observe(brightness_change(start, end, batch, sensor).detach(), batch)
         if adam is not None:
@@ -153,6 +161,42 @@ def test_the_leak_rate_is_learned():
 def test_the_cutoff_frequency_is_learned():
     sensor = learn(model(learn_cutoff_frequency=True), recorded(cutoff_frequency=60.0).index)
     assert sensor.cutoff_frequency == pytest.approx(60.0, rel=0.1)
+
+
+def test_rendered_slopes_tell_the_cutoff_frequency_from_noisy_rates():
+    """Noise of what is multiplied draws a least-squares estimate to 0, but not one with an instrument."""
+    generator = torch.Generator().manual_seed(0)
+
+    def with_noise(batch: EventBatch) -> EventBatch:
+        assert batch.rates is not None
+        noise = batch.rates.std() * torch.randn(batch.rates.shape, generator=generator)
+        return replace(batch, rates=batch.rates + noise)
+
+    def with_slopes(batch: EventBatch) -> EventBatch:
+        slopes = [
+            (brightness(batch.pixels, times + 10_000).log() - brightness(batch.pixels, times - 10_000).log()) / 2e-5
+            for times in (batch.start, batch.end)
+        ]
+        return replace(with_noise(batch), slopes=torch.stack(slopes, dim=-1))
+
+    index, learned = recorded(cutoff_frequency=60.0).index, {}
+    for told in (with_noise, with_slopes):
+        sensor = learn(model(learn_cutoff_frequency=True), index, mode="partner", told=told)
+        learned[told] = sensor.cutoff_frequency
+    assert learned[with_slopes] == pytest.approx(60.0, rel=0.15)
+    assert learned[with_noise] > 90.0
+
+
+def test_slopes_move_nothing_but_the_gradient_of_the_delay():
+    sensor = model(learn_cutoff_frequency=True, cutoff_frequency=40.0)
+    batch = Drawn(recorded(cutoff_frequency=60.0).index, 2, "partner").batch(sensor)
+    other = replace(batch, slopes=torch.randn(len(batch), 2, dtype=torch.float64))
+    lags = [sensor.lag(*seen(sensor, told), told) for told in (batch, other)]
+    torch.testing.assert_close(*lags, rtol=0, atol=0)
+    delay = sensor.get_param_groups()["bandwidth"]
+    gradients = [torch.autograd.grad(lag.sum(), delay)[0] for lag in lags]
+    assert gradients[0] != gradients[1]
+    assert other.subset(other.on > 0).slopes is not None
 
 
 def test_the_refractory_period_is_learned():
