@@ -54,8 +54,9 @@ class MethodDefaults:
     """Silent pairs where the field learns from frames, too, which tell of plain surfaces as well."""
     rays_beside_events: int = 426
     """Rays of frames where the field learns from events, too: those that silent pairs have less."""
-    noisy_pairs_beside_frames: int = 725
-    """Pairs of noisy events where the field learns from frames, too, which then have as many rays as by themselves."""
+    noisy_pairs_beside_frames: int = 256
+    """Pairs of noisy events where the field learns from frames, too, which tell more and have as many rays as by
+    themselves; silent pairs in proportion."""
     event_loss: str = "huber"
     no_event_loss_weight: float = 0.1
     no_event_margin: float = 0.0
@@ -382,6 +383,8 @@ class _Resolver:
         between = self.config.datamanager.silent_mode == "intervals"
         found = between or share > SMALLEST_SILENT_SHARE
         usual = defaults.silent_pairs_beside_frames if self.use_frames else defaults.silent_pairs
+        if self._frames_tell_more:
+            usual = usual * defaults.noisy_pairs_beside_frames // defaults.event_pairs
         silent_pairs = self.use(name, lambda: usual if found else 0)
         value = f"{silent_pairs} pairs a step" if silent_pairs else "they are not searched"
         why = f"pixels are silent for {silence:g} ms and longer during {100 * share:.1f} % of the time"
@@ -548,7 +551,7 @@ class _Resolver:
             what += ", whose weight the errors of events and frames make"
         why = f"supervision is {data.supervision}"
         if self._frames_tell_more:
-            why += "; they have the rays of more pairs, since events are noisy"
+            why += "; they have the rays of most pairs, since events are noisy"
         self.row("frame loss", True, what, why, name)
         frames = recording.blurred_frames if blurred else recording.frames
         if frames is not None and self.use_events:
