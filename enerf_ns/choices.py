@@ -83,12 +83,13 @@ LONGEST_DISTANCE = 10
 MOST_NOISE = 0.1
 """Variance, in squared thresholds, of what noise adds to the events of a pair that is as far apart as any."""
 
-RANGE_OF_NOISE = 2.9
-"""Range of the sums of a random walk that one in a hundred exceeds, in standard deviations at its end."""
-
 LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "cutoff_frequency": 1.0}
 """Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that
 a recording is too short to tell keeps what it starts from."""
+
+LEAST_LAG = 0.05
+"""Least delay of pixels, as a share of the median interval between their events, that is worth a lag in the model: a
+twentieth of a threshold."""
 
 LARGEST_RESOLUTION = 4096
 """Most cells along the box that are chosen for the finest level of the hash grid."""
@@ -216,6 +217,7 @@ class _Resolver:
         self.preset_values: dict[str, Any] = {}
         self._blind_why = ""
         self._frames_tell_more = False
+        self._blind = 0
         if preset is not None:
             name, whole = preset_named(preset), config.defaults.whole_preset
             self.preset_values, self.selection = selections(name, recording, self.parser, whole)
@@ -397,9 +399,15 @@ class _Resolver:
 
     @cached_property
     def _noise(self) -> Estimate:
+        return noise_per_event(index_events(self.recording), self._balanced_thresholds)
+
+    @property
+    def _balanced_thresholds(self) -> tuple[float, float]:
+        """Thresholds with a mean of 1 under which all events together cancel."""
         index = index_events(self.recording)
-        num_on = index.num_positive
-        return noise_per_event(index, (float(max(len(index) - num_on, 1)), float(max(num_on, 1))))
+        num_on = max(index.num_positive, 1)
+        num_off = max(len(index) - index.num_positive, 1)
+        return 2.0 * num_off / (num_on + num_off), 2.0 * num_on / (num_on + num_off)
 
     def _refractory_period(self) -> int:
         """The recording's own, else what its events tell, ns."""
@@ -415,7 +423,7 @@ class _Resolver:
         recording = self.recording
         learns = self.use_events and self.config.defaults.learns_sensor
         name = "model.sensor.refractory_period_ns"
-        blind = attrgetter(name)(Resolution(self.values).applied_to(self.config))
+        blind = self._blind = attrgetter(name)(Resolution(self.values).applied_to(self.config))
         value = f"blind for {blind * 1e-6:.4g} ms after an event" if blind else ""
         why = self._blind_why if blind else "the recording states none, and its events show none"
         self.row("refractory period", self.use_events and bool(blind), value, self.why(name, why), name)
@@ -517,16 +525,17 @@ class _Resolver:
         if self.use_events:
             thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
             index = index_events(self.recording)
-            spread = log_brightness_range(index, thresholds)
-            noise = 0.0
-            if self.config.defaults.learns_sensor:
-                walk = math.sqrt(self._noise.value * float(index.offsets.diff().median()))
-                noise = min(RANGE_OF_NOISE * 0.5 * sum(thresholds) * walk, spread)
-            fits = "more" if spread - noise > LOG_SIGMOID_RANGE else "less"
-            why = f"events of a pixel span {spread:.2g} of log brightness, "
-            why += f"of which {noise:.2g} may be noise, " if noise else ""
-            spread -= noise
-            why += f"{fits} than {LOG_SIGMOID_RANGE:g}"
+            learns = self.config.defaults.learns_sensor
+            if learns and self._blind:  # what pixels miss is seldom as much of either polarity
+                on, off = self._balanced_thresholds
+                thresholds = 0.5 * sum(thresholds) * on, 0.5 * sum(thresholds) * off
+            sums = spread = log_brightness_range(index, thresholds)
+            why = f"events of a pixel span {sums:.2g} of log brightness"
+            if learns:
+                half = log_brightness_range(index, thresholds, parts=2)
+                spread = max(2.0 * half - sums, 0.0)
+                why += f", {half:.2g} in half of the time: {spread:.2g} without what drifts"
+            why += f", {'more' if spread > LOG_SIGMOID_RANGE else 'less'} than {LOG_SIGMOID_RANGE:g}"
         activation = self.use(name, lambda: "exponential" if spread > LOG_SIGMOID_RANGE else "log-sigmoid")
         self.row("high dynamic range", activation == "exponential", activation, self.why(name, why), name)
 

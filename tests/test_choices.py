@@ -446,23 +446,38 @@ def test_a_lens_may_be_ignored(recording: Path):
     assert distorted.selected(None, False).camera == LENS
 
 
-@pytest.mark.parametrize(("spread", "expected"), [(1, "log-sigmoid"), (20, "exponential")])
-def test_what_events_span_decides_whether_brightness_has_a_limit(recording: Path, spread: int, expected: str):
-    """Pixels whose log brightness rises by so many thresholds of 0.25 and falls again."""
-    polarity = np.repeat([1, -1] * 3, spread)
-    times = np.arange(len(polarity)) * 1_000_000 + 10_000_000
+def fired(recording: Path, polarity: np.ndarray) -> EventRecording:
+    """Of 0.2 s, whose pixels, all alike, fire an event of such polarity every so often."""
+    times = np.linspace(10_000_000, 190_000_000, len(polarity)).astype(np.int64)
     pixels = np.tile(np.arange(WIDTH * HEIGHT), len(times))
     times, polarity = np.repeat(times, WIDTH * HEIGHT), np.repeat(polarity, WIDTH * HEIGHT).astype(np.int8)
     events = Events(pixels % WIDTH, pixels // WIDTH, times, polarity)
     long = read_recording(recording)
     trajectory = Trajectory(long.trajectory.times * 2, long.trajectory.positions, long.trajectory.quaternions)
-    made = replace(
+    return replace(
         long, trajectory=trajectory, stream_events=lambda: iter([events]), frames=None, blurred_frames=None,
         contrast_thresholds=(0.25, 0.25),
     )  # fmt: skip
-    row = rows(resolve(ENERF, made))["high dynamic range"]
+
+
+RISES: dict[str, tuple[np.ndarray, float, str]] = {
+    "a little": (np.tile([1, -1], 60), 0.25, "log-sigmoid"),
+    "much": (np.repeat([1, -1] * 3, 20), 5.0, "exponential"),
+    "much, and only in one half": (np.concatenate([np.tile([1, -1], 40), np.repeat([1, -1], 20)]), 5.0, "exponential"),
+    "a little, with drift": (np.tile([1, 1, 1, -1], 12), 6.25, "log-sigmoid"),
+}
+"""Polarities of events, what they span, and how brightness is to be rendered."""
+
+
+@pytest.mark.parametrize("name", RISES)
+def test_what_events_span_decides_whether_brightness_has_a_limit(recording: Path, name: str):
+    """Pixels whose log brightness rises by so many thresholds of 0.25 and falls again."""
+    polarity, span, expected = RISES[name]
+    config = copy.deepcopy(ENERF)
+    config.model.sensor.refractory_period_ns = 0
+    row = rows(resolve(config, fired(recording, polarity)))["high dynamic range"]
     assert row.value == expected and row.kept == (expected == "exponential")
-    assert f"span {0.25 * spread:.2g} of log brightness" in row.why
+    assert f"span {span:.2g} of log brightness" in row.why
 
 
 def test_events_from_beyond_the_box_decide_on_contraction():

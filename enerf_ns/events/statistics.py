@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
 
@@ -46,31 +47,39 @@ def border_rate(index: EventIndex, height: int) -> float:
     return min(float(border / inner.mean()), 1e9) if inner.sum() else 1e9
 
 
-def log_brightness_range(index: EventIndex, contrast_thresholds: tuple[float, float], share: float = 0.99) -> float:
+def log_brightness_range(
+    index: EventIndex, contrast_thresholds: tuple[float, float], share: float = 0.99, parts: int = 1
+) -> float:
     """From the darkest to the brightest that a pixel saw, as its events add up: max less min of the running sum of
     C_on for each positive and -C_off for each negative event, and 0 before the first.
 
-    What a scene spans is at least this; what lies beside it, no pixel saw with it. Noise and wrong thresholds add to
-    the sum as long as the recording goes on.
+    What a scene spans is at least this; what lies beside it, no pixel saw with it. Noise, wrong thresholds and what
+    pixels miss add to the sum as long as the recording goes on, so that halves of it span less than the whole.
 
     Args:
         index: With at least one event.
         contrast_thresholds: C_on and C_off, in units of log brightness.
         share: Of the pixels with events, those that stay below what is returned.
+        parts: Equal parts of the time between the first and the last event, each with sums of its own; the largest of
+            their ranges is returned.
     """
     on, off = contrast_thresholds
     counts = index.offsets.diff()
     active = counts.nonzero()[:, 0]
     pixels = active[:: -(-len(active) // NUM_PIXELS)]
     counts = counts[pixels]
-    owner = torch.repeat_interleave(torch.arange(len(pixels), device=pixels.device), counts)
-    first = index.offsets[pixels]
-    number = torch.arange(len(owner), device=pixels.device) - (counts.cumsum(0) - counts)[owner]
-    before = torch.where(first > 0, index.positives[(first - 1).clamp(min=0)], 0)
-    positive = index.positives[first[owner] + number] - before[owner]
-    sums = on * positive.double() - off * (number + 1 - positive).double()
-    highest = torch.zeros(len(pixels), dtype=torch.float64, device=pixels.device)
-    lowest = highest.clone()
-    highest.scatter_reduce_(0, owner, sums, "amax")
-    lowest.scatter_reduce_(0, owner, sums, "amin")
-    return float((highest - lowest).quantile(share))
+    order = torch.repeat_interleave(torch.arange(len(pixels), device=pixels.device), counts)
+    events = torch.arange(len(order), device=pixels.device) + (index.offsets[pixels] - counts.cumsum(0) + counts)[order]
+    begin, end = index.times.min(), index.times.max()
+    owner = order * parts + (index.times[events] - begin) * parts // (end - begin + 1)
+
+    def sums(number: Tensor) -> Tensor:
+        """After a number of events of the index, all pixels together."""
+        positive = torch.where(number > 0, index.positives[(number - 1).clamp(min=0)], 0).double()
+        return on * positive - off * (number - positive)
+
+    around = torch.stack([sums(events), sums(events + 1)])
+    none = torch.zeros(len(pixels) * parts, dtype=torch.float64, device=pixels.device)
+    highest = none.scatter_reduce(0, owner, around.amax(0), "amax", include_self=False)
+    lowest = none.scatter_reduce(0, owner, around.amin(0), "amin", include_self=False)
+    return float((highest - lowest).view(-1, parts).quantile(share, dim=0).max())

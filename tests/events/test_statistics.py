@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -63,12 +65,13 @@ def random_events() -> Events:
     return Events(x, y, np.sort(generator.integers(0, 10**9, number)), polarity)
 
 
-def ranges_by_a_loop(events: Events) -> list[float]:
-    """Of each pixel with events, in the order of the pixels."""
+def ranges_by_a_loop(events: Events, begin: int = 0, end: int = 10**9) -> list[float]:
+    """Of each pixel with events, in the order of the pixels, from one time to another."""
     sums: dict[int, list[float]] = {}
-    for x, y, p in zip(events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True):
+    for x, y, p, t in zip(*(column.tolist() for column in (events.x, events.y, events.p, events.t)), strict=True):
         running = sums.setdefault(y * MANY_COLUMNS + x, [0.0])
-        running.append(running[-1] + (THRESHOLDS[0] if p > 0 else -THRESHOLDS[1]))
+        if begin <= t < end:
+            running.append(running[-1] + (THRESHOLDS[0] if p > 0 else -THRESHOLDS[1]))
     return [max(running) - min(running) for _, running in sorted(sums.items())]
 
 
@@ -77,6 +80,17 @@ def test_it_is_the_quantile_over_pixels_of_how_far_their_sums_go(share: float):
     events = random_events()
     found = log_brightness_range(EventIndex.from_events(events, MANY_COLUMNS, MANY_ROWS), THRESHOLDS, share)
     assert found == pytest.approx(np.quantile(ranges_by_a_loop(events)[::2], share))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.99])
+def test_of_parts_of_the_time_it_is_the_largest(share: float):
+    events = random_events()
+    first, last = int(events.t[0]), int(events.t[-1]) + 1
+    ends = [first + (last - first) * part / 3 for part in range(4)]
+    index = EventIndex.from_events(events, MANY_COLUMNS, MANY_ROWS)
+    found = log_brightness_range(index, THRESHOLDS, share, parts=3)
+    parts = [np.quantile(ranges_by_a_loop(events, *between)[::2], share) for between in pairwise(ends)]
+    assert found == pytest.approx(max(parts))
 
 
 def test_a_pixel_that_only_brightens_spans_its_events():
