@@ -216,13 +216,24 @@ def errors_of_learning(index: EventIndex) -> dict[str, float]:
     """
     root = math.sqrt(len(index))
     watched = 1e-9 * int((index.offsets.diff() > 0).sum()) * int(index.times.max() - index.times.min())
-    times, _, follows = _sampled(index)
-    interval = 1e-6 * float(np.median(np.diff(times)[follows])) if follows.any() else math.inf
     return {
         "threshold_ratio": 2.0 / root,
         "leak_rate": root / watched if watched else math.inf,
-        "cutoff_frequency": interval / root,
+        "cutoff_frequency": median_interval(index) / root,
     }
+
+
+def median_interval(index: EventIndex) -> float:
+    """Median time (ms) from an event to the next of its pixel, in which brightness changes by a threshold.
+
+    Args:
+        index: On the CPU.
+
+    Returns:
+        Infinity where no pixel has two events.
+    """
+    times, _, follows = _sampled(index)
+    return 1e-6 * float(np.median(np.diff(times)[follows])) if follows.any() else math.inf
 
 
 @dataclass(frozen=True)

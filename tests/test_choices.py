@@ -277,6 +277,20 @@ def test_a_flag_stands_and_is_said_to(recording: Path, tmp_path: Path, setting: 
     assert rows(resolution)[part].why == "set by flag"
 
 
+def test_a_delay_of_less_than_a_twentieth_of_the_time_between_events_is_none(recording: Path):
+    """Where a flag has it learned, any is."""
+    unknown = replace(fired(recording, np.tile([1, -1], 60)), contrast_thresholds=None)
+    interval = 180.0 / 119
+    found = resolve(ENERF, unknown)
+    assert found.values["model.sensor.least_delay"] == pytest.approx(0.05 * interval, rel=1e-3)
+    assert rows(found)["bandwidth"].value.endswith(
+        f"is learned, and left out if it is less than {0.05 * interval:.2g} ms"
+    )
+    forced = copy.deepcopy(ENERF)
+    forced.model.sensor.learn_cutoff_frequency = True
+    assert "model.sensor.least_delay" not in resolve(forced, unknown).values
+
+
 @pytest.mark.parametrize(
     ("setting", "part", "value"),
     [

@@ -14,6 +14,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from small_runs import set_up, small_config
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from enerf_ns.enerf_pipeline import LAG_TOLD_AFTER
 from enerf_ns.events.batch import TrainBatch
 from enerf_ns.ray_samplers import paired_rand
 from enerf_ns.supervision.event_supervision import brightness_change
@@ -167,3 +168,23 @@ UNUSED = (
     "hdf5plugin", "rosbags", "trimesh", "enerf_ns.simulator.engine", "enerf_ns.report",
     "enerf_ns.dataparsers.inspection", "enerf_ns.numerics", "torchmetrics.image.lpip",
 )  # fmt: skip
+
+
+def test_a_lag_that_was_learned_to_be_small_costs_nothing_from_then_on(recording: Path, tmp_path: Path, capsys):
+    """What is learned of it was far from settled here, so that a lag of up to 1 ms is called small."""
+    lag = {"sensor__learn_cutoff_frequency": True, "sensor__least_delay": 1.0}
+    without = pipeline_of(recording, tmp_path / "without")
+    trainer = set_up(small_config(recording, tmp_path / "lag", **{**NOTHING, **lag}))
+    delay = trainer.pipeline.model.sensor.delay
+    trainer.train_iteration(0)
+    assert delay.any() and cost(trainer.pipeline, losses) > cost(without, losses)
+    for step in range(LAG_TOLD_AFTER, LAG_TOLD_AFTER + 3):
+        trainer.train_iteration(step)
+        batch = trainer.pipeline.last_step.batch.events
+        assert not delay.any() and batch.rates is None and batch.slopes is None
+    assert capsys.readouterr().out.count("left out from here on") == 1
+    assert cost(trainer.pipeline, losses) == cost(without, losses)
+    trainer.save_checkpoint(LAG_TOLD_AFTER + 2)
+    config = small_config(recording, tmp_path / "again", **{**NOTHING, **lag})
+    config.load_dir, config.max_num_iterations = trainer.checkpoint_dir, 2 * LAG_TOLD_AFTER
+    assert not set_up(config).pipeline.model.sensor.lags

@@ -63,6 +63,8 @@ class SensorModelConfig:
     learn_cutoff_frequency: Optional[bool] = None  # noqa: UP045
     """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds, and
     pixels are not blind after events, which misleads it."""
+    least_delay: tyro.conf.Suppress[Optional[float]] = None  # noqa: UP045
+    """Delay (ms) of the photoreceptor that matters; one that is learned to be less is left out. None: any."""
     second_cutoff_frequency: Optional[float] = None  # noqa: UP045
     """Cut-off frequency (Hz) of a second stage behind the photoreceptor, the same at any brightness. None: there is
     none."""
@@ -110,6 +112,9 @@ class SensorModel(nn.Module):
         self.delay: Tensor | float = delay
         if config.learn_cutoff_frequency:
             self.delay = nn.Parameter(torch.tensor(delay))
+            self.register_load_state_dict_post_hook(SensorModel._resume_lag)
+        self.least_delay = config.least_delay or 0.0
+        self._has_lag = True
         self.threshold_map = None
         if config.learn_threshold_map:
             assert config.width is not None and config.height is not None
@@ -184,12 +189,34 @@ class SensorModel(nn.Module):
     @property
     def lags(self) -> bool:
         """Whether pixels follow brightness with a delay."""
-        return isinstance(self.delay, Tensor) or self.delay + self.second_delay != 0.0
+        stated = 0.0 if isinstance(self.delay, Tensor) else self.delay
+        return self.learns_lag or stated + self.second_delay != 0.0
 
     @property
     def learns_lag(self) -> bool:
         """Whether the delay of the photoreceptor is learned, best from batches with `slopes`."""
-        return isinstance(self.delay, nn.Parameter)
+        return isinstance(self.delay, nn.Parameter) and self._has_lag
+
+    @torch.no_grad()
+    def leave_out_small_lag(self) -> str | None:
+        """Learns no delay from now on, and has none, where the one that is learned is less than `least_delay`.
+
+        Returns:
+            A sentence that says so; None where there is nothing to say.
+        """
+        if not self.learns_lag or float(self.delay) >= self.least_delay:
+            return None
+        found = max(float(self.delay), 0.0)
+        torch.as_tensor(self.delay).zero_()
+        self._has_lag = False
+        least = self.least_delay
+        return (
+            f"Pixels lag behind brightness by {found:.2g} ms, less than {least:.2g} ms: this is left out from here on."
+        )
+
+    def _resume_lag(self, _: object) -> None:
+        """Of a checkpoint: 0 is what the delay is where it was left out, and nothing that is learned is ever 0."""
+        self._has_lag = float(self.delay) != 0.0
 
     @property
     def cutoff_frequency(self) -> float:

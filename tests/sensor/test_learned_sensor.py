@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -197,6 +198,46 @@ def test_slopes_move_nothing_but_the_gradient_of_the_delay():
     gradients = [torch.autograd.grad(lag.sum(), delay)[0] for lag in lags]
     assert gradients[0] != gradients[1]
     assert other.subset(other.on > 0).slopes is not None
+
+
+LAGS: dict[str, tuple[float, dict[str, Any], bool, bool]] = {
+    "small": (0.04, {"learn_cutoff_frequency": True, "least_delay": 0.05}, False, False),
+    "large": (0.06, {"learn_cutoff_frequency": True, "least_delay": 0.05}, True, True),
+    "below 0": (-0.1, {"learn_cutoff_frequency": True, "least_delay": 0.05}, False, False),
+    "any": (0.001, {"learn_cutoff_frequency": True}, True, True),
+    "small, with a second stage": (
+        0.04, {"learn_cutoff_frequency": True, "least_delay": 0.05, "second_cutoff_frequency": 30.0}, False, True,
+    ),
+    "stated": (0.04, {"cutoff_frequency": 1e3 / (2 * math.pi * 0.04), "least_delay": 0.05}, False, True),
+}  # fmt: skip
+"""Delays (ms) of sensors, and whether they are still learned, and lag, after small ones were left out."""
+
+
+@pytest.mark.parametrize("name", LAGS)
+def test_a_lag_that_is_learned_to_be_small_is_left_out(name: str):
+    """Also by who goes on from a checkpoint."""
+    delay, settings, learns, lags = LAGS[name]
+    sensor = model(**settings)
+    learned = sensor.learns_lag
+    if isinstance(sensor.delay, torch.nn.Parameter):
+        sensor.delay.data.fill_(delay)
+    said = sensor.leave_out_small_lag()
+    assert (said is not None) == (learned and not learns) and (said is None or "0.05 ms" in said)
+    going_on = model(**settings)
+    going_on.load_state_dict(sensor.state_dict())
+    for each in (sensor, going_on):
+        assert (each.learns_lag, each.lags) == (learns, lags)
+        assert float(torch.as_tensor(each.delay)) == pytest.approx(0.0 if learned and not learns else delay)
+        assert each.leave_out_small_lag() is None
+
+
+def test_a_sensor_that_has_no_lag_loses_it_and_one_that_has_keeps_it():
+    for cutoff, lags in ((0.0, False), (400.0, True)):
+        sensor = learn(
+            model(learn_cutoff_frequency=True, least_delay=0.05), recorded(cutoff_frequency=cutoff).index, 200
+        )
+        sensor.leave_out_small_lag()
+        assert sensor.lags == lags, sensor.delay
 
 
 def test_the_refractory_period_is_learned():
