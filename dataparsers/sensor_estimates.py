@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.optimize import nnls
+from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.frame_contrast import thresholds_from_frames
@@ -53,6 +54,19 @@ TOLD = 3.0
 LEAST_GROWTH = 0.5
 """Least share of the variance of the longest sums that a spread of thresholds must make to be told: a scene makes it
 grow by some tenths."""
+
+
+FEWEST_SLOPE = 16
+"""Fewest events of a pixel whose sum has a slope that tells anything."""
+
+FIRST_DIFFERENCE = 0.05
+"""Standard deviation of the relative difference of a pixel's thresholds, before anything is known of it."""
+
+MEDIAN_OF_SQUARES = 0.4549
+"""Median of the square of a normal deviate of variance 1."""
+
+PIXELS_AT_ONCE = 2**14
+"""Pixels whose events are looked at together."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +212,69 @@ def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float])
         f"{growth.variance:.3g} squared thresholds"
     )
     return Estimate(float(growth.values[1]), float(growth.errors[1]), why)
+
+
+def threshold_differences(
+    index: EventIndex, contrast_thresholds: tuple[float, float], noise: float
+) -> tuple[Float32[Tensor, " pixels"], Float32[Tensor, " pixels"]]:
+    """By how much the on threshold of each pixel deviates more than its off threshold, as its events tell.
+
+    A pixel whose on threshold is higher, relative to the sensor's, than its off threshold fires too few on events: the
+    running sum of its events falls as they go on, while brightness comes and goes. So the difference is the slope of
+    the sum (least squares) over the events, in thresholds. A leak adds to it in proportion to time, a wrong ratio of
+    the sensor's thresholds everywhere alike: both are fitted to the slopes of all pixels, and taken off. How far
+    brightness itself makes slopes differ, which falls with the cube of the number of events, is told by those of the
+    first and the second half of the events of each pixel.
+
+    Args:
+        index: On the CPU, of a sensor without a refractory period, during which changes are missed.
+        contrast_thresholds: C_on and C_off; only their ratio matters.
+        noise: What noise adds to the variance of a sum with each event (`noise_per_event`).
+
+    Returns:
+        The relative difference, and its variance; 0 and infinity of pixels with fewer than `FEWEST_SLOPE` events.
+    """
+    on, off = (threshold / (0.5 * sum(contrast_thresholds)) for threshold in contrast_thresholds)
+    parts = [_sums_for_slopes(index, on, off, first) for first in range(0, len(index.offsets) - 1, PIXELS_AT_ONCE)]
+    halves = np.concatenate(parts, axis=1)  # sums, pixels, halves
+    number = halves[0].sum(1)
+    told = number >= FEWEST_SLOPE
+    difference, variance = np.zeros(len(number)), np.full(len(number), np.inf)
+    if told.any():
+        slopes, (first, second) = _slopes(halves.sum(2)[:, told]), _slopes(halves[:, told]).T
+        n = number[told]
+        scatter = float(np.median((second - first) ** 2 * n**3)) / MEDIAN_OF_SQUARES
+        scene = max(scatter / 16 - 1.2 * noise * float(np.median(n**2)), 0.0)
+        spread = scene / n**3 + 4.8 * noise / n
+        common = np.stack([np.ones(len(n)), 1 / n], axis=1)
+        weight = 1 / np.sqrt(spread + FIRST_DIFFERENCE**2)
+        fitted = np.linalg.lstsq(common * weight[:, None], slopes * weight, rcond=None)[0]
+        difference[told], variance[told] = common @ fitted - slopes, np.maximum(spread, 1e-8)
+    return torch.from_numpy(difference).float(), torch.from_numpy(variance).float()
+
+
+def _sums_for_slopes(index: EventIndex, on: float, off: float, first: int) -> Float64[np.ndarray, "5 pixels 2"]:
+    """Of the halves of the events of some pixels: their number, and sums of m, y, m * m and m * y, with y the sum of
+    the events of the pixel so far, in mean thresholds, and m half of what they sum to without their signs."""
+    offsets = index.offsets[first : first + PIXELS_AT_ONCE + 1]
+    begin, end = int(offsets[0]), int(offsets[-1])
+    counts = offsets.diff()
+    pixel = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    number = torch.arange(begin, end) - offsets[pixel] + 1
+    before = torch.where(offsets > 0, index.positives[(offsets - 1).clamp(min=0)], 0)
+    rises = on * (index.positives[begin:end] - before[pixel]).double()
+    falls = off * number.double() - rises * (off / on)
+    level, passed = rises - falls, 0.5 * (rises + falls)
+    part = (2 * pixel + (2 * number > counts[pixel])).numpy()
+    weights = (None, passed, level, passed * passed, passed * level)
+    columns = [np.bincount(part, None if w is None else w.numpy(), 2 * len(counts)) for w in weights]
+    return np.stack(columns).astype(np.float64).reshape(5, -1, 2)
+
+
+def _slopes(sums: Float64[np.ndarray, "5 *sets"]) -> Float64[np.ndarray, "*sets"]:
+    """Of y over m by least squares, from their number and their sums."""
+    number, m, y, mm, my = sums
+    return (number * my - m * y) / np.maximum(number * mm - m * m, 1e-12)
 
 
 def errors_of_learning(index: EventIndex) -> dict[str, float]:

@@ -19,7 +19,9 @@ from tyro.conf import Fixed, Suppress
 from enerf_ns.choices import MethodDefaults, Resolution, resolve
 from enerf_ns.dataparsers.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
+from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.sensor_estimates import noise_per_event, threshold_differences
 from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -116,7 +118,10 @@ class EnerfPipeline(VanillaPipeline):
         """Is told where each part of a step ends."""
         self.seconds_a_step: float | None = None
         """What a training step will take; None where nobody needs to know, since it is small."""
-        self._fit_memory(trains=kwargs.get("test_mode", "val") == "val")
+        trains = kwargs.get("test_mode", "val") == "val"
+        self._fit_memory(trains)
+        if trains:
+            self._start_threshold_map()
         self._viewer: ViewerControl | None = None
         self.model.seen_volume = self.seen_volume
         self.world_size = world_size
@@ -177,6 +182,17 @@ class EnerfPipeline(VanillaPipeline):
         self.model.samples_at_once = at_once
         again = 1.0 if at_once is None else 4.0 / 3.0  # parts are rendered once more for the backward pass
         self.seconds_a_step = again * cost.seconds * trained / rays if trains else None
+
+    @torch.no_grad()
+    def _start_threshold_map(self) -> None:
+        """Has the map of thresholds start from what events tell before training, where pixels are never blind."""
+        sensor = self.model.sensor
+        if sensor.threshold_map is None or sensor.refractory_period:
+            return
+        index = index_events(self.datamanager.recording)
+        on, off = (float(threshold) for threshold in sensor.contrast_thresholds)
+        noise = noise_per_event(index, (on, off)).value
+        sensor.threshold_map.start_from(*threshold_differences(index, (on, off), noise))
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch."""

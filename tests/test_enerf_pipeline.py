@@ -11,6 +11,9 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 
+from enerf_ns.dataparsers import sensor_estimates
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.sensor_estimates import noise_per_event, threshold_differences
 from enerf_ns.enerf_pipeline import SLOPE_NS, SLOPE_PAIRS
 from enerf_ns.sensor.response import Logarithm, luma
 
@@ -81,6 +84,24 @@ def test_slopes_are_those_of_what_is_rendered(pipeline: Any):
         assert expected.abs().max() > 1.0
         torch.testing.assert_close(found[:number, instant], expected.float(), rtol=1e-3, atol=1e-2)
     pipeline.train()
+
+
+@pytest.mark.parametrize(("mode", "blind", "starts"), [("val", 0, True), ("test", 0, False), ("val", 1000, False)])
+def test_a_map_of_thresholds_starts_from_the_events(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: Any, blind: int, starts: bool
+):
+    """To train, where pixels are never blind; nothing of it is stored beside the map."""
+    monkeypatch.setattr(sensor_estimates, "FEWEST_SLOPE", 2)  # a tenth of a second has no more
+    config = small_config(recording, tmp_path, sensor__learn_threshold_map=True, sensor__refractory_period_ns=blind)
+    made = config.resolved().pipeline.setup(device="cpu", test_mode=mode)
+    found = made.model.sensor.threshold_map
+    index = index_events(made.datamanager.recording)
+    noise = noise_per_event(index, (0.25, 0.25)).value
+    difference, variance = threshold_differences(index, (0.25, 0.25), noise)
+    assert variance.isfinite().any() and found.deviations.any() == starts
+    expected = torch.stack([1.0 / variance, difference / variance], dim=-1)
+    torch.testing.assert_close(found.known, expected if starts else torch.zeros_like(expected))
+    assert "known" not in found.state_dict()
 
 
 def test_the_config_of_a_pipeline_has_nothing_open_and_the_users_is_as_it_was(recording: Path, tmp_path: Path):

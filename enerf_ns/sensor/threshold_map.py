@@ -30,7 +30,8 @@ class ThresholdMap(nn.Module):
     of residuals at that time; an observation counts as the square of its number, so that those of a field that was not
     yet learnt fade. A ridge draws the deviations to 0: its strength is the deviations' own variance, which is estimated
     from all pixels (empirical Bayes), so that a sensor whose pixels are alike gets none. The mean over the pixels stays
-    0, since that belongs to the sensor's thresholds.
+    0, since that belongs to the sensor's thresholds. What a pixel's own events tell of the difference of both
+    deviations (`start_from`) is one more equation.
 
     Nothing here has a gradient or a learning rate; everything is stored with the run.
 
@@ -43,6 +44,7 @@ class ThresholdMap(nn.Module):
     variance: Tensor
     spread: Tensor
     number: Tensor
+    known: Tensor
 
     def __init__(self, num_pixels: int):
         super().__init__()
@@ -51,11 +53,23 @@ class ThresholdMap(nn.Module):
         self.register_buffer("variance", torch.ones(()))
         self.register_buffer("spread", torch.full((2,), FIRST_SPREAD))
         self.register_buffer("number", torch.zeros(()))
+        self.register_buffer("known", torch.zeros(num_pixels, 2), persistent=False)
         self._observed = 0
 
     def factors(self, pixels: Int64[Tensor, " pairs"]) -> Float[Tensor, "pairs 2"]:
         """What the on and off thresholds of pixels are multiplied by."""
         return 1.0 + self.deviations[pixels]
+
+    @torch.no_grad()
+    def start_from(self, difference: Float[Tensor, " pixels"], variance: Float[Tensor, " pixels"]) -> None:
+        """Takes in what is known beforehand, which is not stored with the run.
+
+        Args:
+            difference: Deviation of the on threshold less that of the off threshold.
+            variance: Of that; infinite where nothing is known.
+        """
+        self.known = torch.stack([1.0 / variance, difference / variance], dim=-1).to(self.deviations.device)
+        self._solve()
 
     @torch.no_grad()
     @full_precision
@@ -95,13 +109,15 @@ class ThresholdMap(nn.Module):
 
     def _solve(self) -> None:
         """Deviations from the normal equations, and how far they spread from what they and their errors are."""
-        aa, ab, bb, ar, br = (self.products / self.number.square()).unbind(dim=-1)
+        weight, weighted = self.known.unbind(dim=-1)
+        equations = torch.stack([weight, -weight, weight, weighted, -weighted], dim=-1)
+        aa, ab, bb, ar, br = (self.products / self.number.clamp(min=1.0).square() + equations).unbind(dim=-1)
         prior = self.spread.square().reciprocal()
         aa, bb = aa + prior[0], bb + prior[1]
         determinant = aa * bb - ab * ab
         solved = torch.stack([bb * ar - ab * br, aa * br - ab * ar], dim=-1) / determinant[:, None]
         errors = torch.stack([bb, aa], dim=-1) / determinant[:, None]
-        seen = (self.products[:, [0, 2]] > 0.0).float()
+        seen = ((self.products[:, [0, 2]] > 0.0) | (weight[:, None] > 0.0)).float()
         share = seen / seen.sum(dim=0).clamp(min=1.0)
         solved = seen * (solved - (share * solved).sum(dim=0))
         spread = (share * (solved.square() + errors)).sum(dim=0).sqrt()

@@ -13,17 +13,20 @@ import pytest
 from waves import HEIGHT, WIDTH, events_of_waves, recording_of
 
 from enerf_ns.choices import resolve
+from enerf_ns.dataparsers import sensor_estimates
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import Events
 from enerf_ns.dataparsers.sensor_estimates import (
     ASSUMED_THRESHOLD,
+    FEWEST_SLOPE,
     contrast_thresholds,
     errors_of_learning,
     noise_per_event,
     refractory_period,
     share_closer,
+    threshold_differences,
     threshold_spread,
 )
 from enerf_ns.enerf_config import enerf
@@ -162,6 +165,28 @@ def test_the_spread_of_thresholds_is_found_and_none_where_there_is_none():
             assert found is None
         else:
             assert found is not None and abs(found.value - spread) < 3 * found.error < 0.1
+
+
+def test_the_difference_of_the_thresholds_of_a_pixel_is_the_slope_of_its_sum(monkeypatch: pytest.MonkeyPatch):
+    """By NumPy's fits, but for what all pixels have in common; however many are looked at together."""
+    generator = np.random.default_rng(6)
+    numbers = generator.integers(3, 90, 23)
+    pixel = np.repeat(np.arange(23), numbers)
+    is_on = generator.random(len(pixel)) < 0.4
+    times = 10**9 + np.arange(len(pixel))
+    index = EventIndex.from_events(Events(pixel, np.zeros_like(pixel), times, np.where(is_on, 1, -1)), 23, 1)
+    monkeypatch.setattr(sensor_estimates, "PIXELS_AT_ONCE", 7)
+    difference, variance = (column.numpy() for column in threshold_differences(index, (0.24, 0.16), 0.1))
+    told = numbers >= FEWEST_SLOPE
+    assert (difference[~told] == 0.0).all() and np.isinf(variance[~told]).all() and (variance[told] < 1.0).all()
+    slopes = []
+    for number in np.flatnonzero(told):
+        steps = np.where(is_on[pixel == number], 1.2, -0.8)
+        slopes.append(np.polyfit(0.5 * np.abs(steps).cumsum(), steps.cumsum(), 1)[0])
+    common = difference[told] + slopes
+    columns = np.stack([np.ones(told.sum()), 1 / numbers[told]], axis=1)
+    fitted = columns @ np.linalg.lstsq(columns, common, rcond=None)[0]
+    np.testing.assert_allclose(common, fitted, atol=1e-6)
 
 
 def test_the_counts_of_both_polarities_tell_the_ratio_and_the_mean_is_assumed(tmp_path: Path):

@@ -16,10 +16,12 @@ from torch import Tensor
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.sensor_estimates import threshold_differences
 from enerf_ns.enerf_config import SENSOR_LEARNING_RATES
 from enerf_ns.events.batch import EventBatch
 from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
 from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.sensor.threshold_map import SOLVED_EVERY, ThresholdMap
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
 
@@ -268,6 +270,46 @@ def test_thresholds_of_single_pixels_are_learned():
         found = sensor.threshold_map.deviations[:, polarity].numpy()
         assert np.corrcoef(found, made.thresholds[polarity])[0, 1] > 0.95
     assert sensor.threshold_map.spread.tolist() == pytest.approx([0.06, 0.06], rel=0.3)
+
+
+@pytest.mark.parametrize("settings", [{}, {"leak_rate": 1.0}, {"contrast_thresholds": (0.234, 0.166)}], ids=str)
+def test_events_alone_tell_how_far_the_thresholds_of_a_pixel_differ(settings: dict[str, Any]):
+    made = recorded(threshold_spread=0.06, **settings)
+    difference, variance = threshold_differences(made.index, settings.get("contrast_thresholds", (0.2, 0.2)), 0.0)
+    deviations = made.thresholds / made.thresholds.mean(1, keepdims=True) - 1.0
+    expected = deviations[0] - deviations[1]
+    assert np.corrcoef(difference, expected)[0, 1] > 0.9
+    assert 0.3 < np.sqrt(np.mean((difference.numpy() - expected) ** 2 / variance.numpy())) < 2.0
+
+
+def test_a_map_solves_what_it_observed_with_what_was_known_before():
+    """Of single pixels, by NumPy's least squares; of one of which nothing is known or seen, nothing is said."""
+    generator = np.random.default_rng(4)
+    known, variance = np.array([0.08, -0.02, 0.0]), np.array([1e-4, 1e-2, np.inf])
+    on, off = generator.integers(1, 6, (2, 2, SOLVED_EVERY))
+    residual = 0.1 * generator.standard_normal((2, SOLVED_EVERY))
+    solver = ThresholdMap(3)
+    solver.start_from(torch.from_numpy(known).float(), torch.from_numpy(variance).float())
+    start, spread = solver.deviations.clone(), solver.spread.clone()
+    assert float(start[0] @ torch.tensor([1.0, -1.0])) > 0.03 and solver.deviations[2].tolist() == [0.0, 0.0]
+    solver.deviations.zero_()  # which weighs residuals
+    for step in range(SOLVED_EVERY):
+        pixels = torch.arange(2)
+        columns = [torch.from_numpy(column[:, step]) for column in (on, off, residual.astype(np.float32))]
+        solver.observe(pixels, *columns, (1.0, 1.0))
+    weights = np.arange(1, SOLVED_EVERY + 1) / SOLVED_EVERY
+    running, found = 1.0, []
+    for step in range(SOLVED_EVERY):
+        running += ((residual[:, step] ** 2).mean() - running) / (step + 1)
+        weights[step] /= np.sqrt(max(running, 1e-6))
+    for pixel in range(2):
+        rows = np.stack([on[pixel], -off[pixel]], axis=1) * weights[:, None]
+        ridge = np.diag(1.0 / spread.double().numpy())
+        difference = np.array([[1.0, -1.0]]) / np.sqrt(variance[pixel])
+        right = [residual[pixel] * weights, known[pixel : pixel + 1] / np.sqrt(variance[pixel]), np.zeros(2)]
+        found.append(np.linalg.lstsq(np.concatenate([rows, difference, ridge]), np.concatenate(right), rcond=None)[0])
+    expected = np.array(found) - np.mean(found, axis=0)
+    np.testing.assert_allclose(solver.deviations[:2].numpy(), expected, atol=1e-4)
 
 
 def test_pixels_that_are_alike_stay_so():
