@@ -95,6 +95,7 @@ def test_a_map_of_thresholds_starts_from_the_events(
     config = small_config(recording, tmp_path, sensor__learn_threshold_map=True, sensor__refractory_period_ns=blind)
     made = config.resolved().pipeline.setup(device="cpu", test_mode=mode)
     found = made.model.sensor.threshold_map
+    assert found is not None
     index = index_events(made.datamanager.recording)
     noise = noise_per_event(index, (0.25, 0.25)).value
     difference, variance = threshold_differences(index, (0.25, 0.25), noise)

@@ -65,7 +65,7 @@ def random_events() -> Events:
     return Events(x, y, np.sort(generator.integers(0, 10**9, number)), polarity)
 
 
-def ranges_by_a_loop(events: Events, begin: int = 0, end: int = 10**9) -> list[float]:
+def ranges_by_a_loop(events: Events, begin: float = 0, end: float = 10**9) -> list[float]:
     """Of each pixel with events, in the order of the pixels, from one time to another."""
     sums: dict[int, list[float]] = {}
     for x, y, p, t in zip(*(column.tolist() for column in (events.x, events.y, events.p, events.t)), strict=True):

@@ -295,8 +295,8 @@ def test_a_map_solves_what_it_observed_with_what_was_known_before():
     solver.deviations.zero_()  # which weighs residuals
     for step in range(SOLVED_EVERY):
         pixels = torch.arange(2)
-        columns = [torch.from_numpy(column[:, step]) for column in (on, off, residual.astype(np.float32))]
-        solver.observe(pixels, *columns, (1.0, 1.0))
+        ups, downs, left = (torch.from_numpy(column[:, step]) for column in (on, off, residual.astype(np.float32)))
+        solver.observe(pixels, ups, downs, left, (1.0, 1.0))
     weights = np.arange(1, SOLVED_EVERY + 1) / SOLVED_EVERY
     running, found = 1.0, []
     for step in range(SOLVED_EVERY):
