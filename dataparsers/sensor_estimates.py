@@ -65,7 +65,7 @@ FIRST_DIFFERENCE = 0.05
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the square of a normal deviate of variance 1."""
 
-PIXELS_AT_ONCE = 2**14
+PIXELS_AT_ONCE = 2**12
 """Pixels whose events are looked at together."""
 
 
@@ -243,6 +243,7 @@ def threshold_differences(
     if told.any():
         slopes, (first, second) = _slopes(halves.sum(2)[:, told]), _slopes(halves[:, told]).T
         n = number[told]
+        # a random walk's slope over n steps has a variance of 1.2 of a step's over n; m grows by a half with each
         scatter = float(np.median((second - first) ** 2 * n**3)) / MEDIAN_OF_SQUARES
         scene = max(scatter / 16 - 1.2 * noise * float(np.median(n**2)), 0.0)
         spread = scene / n**3 + 4.8 * noise / n

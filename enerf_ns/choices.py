@@ -526,7 +526,7 @@ class _Resolver:
     def _dynamic_range(self) -> None:
         """Whether brightness has an upper limit."""
         name, why = "model.brightness", "no events are used"
-        spread = 0.0
+        span = 0.0
         if self.use_events:
             thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
             index = index_events(self.recording)
@@ -534,14 +534,14 @@ class _Resolver:
             if learns and self._blind:  # what pixels miss is seldom as much of either polarity
                 on, off = self._balanced_thresholds
                 thresholds = 0.5 * sum(thresholds) * on, 0.5 * sum(thresholds) * off
-            sums = spread = log_brightness_range(index, thresholds)
+            sums = span = log_brightness_range(index, thresholds)
             why = f"events of a pixel span {sums:.2g} of log brightness"
             if learns:
                 half = log_brightness_range(index, thresholds, parts=2)
-                spread = max(2.0 * half - sums, 0.0)
-                why += f", {half:.2g} in half of the time: {spread:.2g} without what drifts"
-            why += f", {'more' if spread > LOG_SIGMOID_RANGE else 'less'} than {LOG_SIGMOID_RANGE:g}"
-        activation = self.use(name, lambda: "exponential" if spread > LOG_SIGMOID_RANGE else "log-sigmoid")
+                span = max(2.0 * half - sums, 0.0)
+                why += f", {half:.2g} in half of the time: {span:.2g} without what drifts"
+            why += f", {'more' if span > LOG_SIGMOID_RANGE else 'less'} than {LOG_SIGMOID_RANGE:g}"
+        activation = self.use(name, lambda: "exponential" if span > LOG_SIGMOID_RANGE else "log-sigmoid")
         self.row("high dynamic range", activation == "exponential", activation, self.why(name, why), name)
 
     def _frames(self) -> None:
