@@ -481,8 +481,8 @@ class _Resolver:
             why = "set by flag" if given else self.why(name, why)
             value = f"{what} is learned" if kept else stated.format(given) if given else ""
             if part == "bandwidth" and kept and index is not None and attrgetter(name)(self.config) is None:
-                least = LEAST_LAG * median_interval(index)
-                self.use("model.sensor.least_delay", lambda least=least: least)
+                found = LEAST_LAG * median_interval(index)
+                least = self.use("model.sensor.least_delay", lambda found=found: found)
                 value += f", and left out if it is less than {least:.2g} ms"
             self.row(part, self.use_events and bool(kept or given), value, why, name)
 

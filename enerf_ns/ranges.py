@@ -96,6 +96,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "refractory_period_ns": (0, LONGEST_REFRACTORY_PERIOD),
     "leak_rate": (0.0, 1e6),
     "cutoff_frequency": (1e-3, 1e9),
+    "least_delay": (0.0, 1e9),
     "second_cutoff_frequency": (1e-3, 1e9),
     "width": (1, 2**15),
     "height": (1, 2**15),

@@ -63,8 +63,9 @@ class SensorModelConfig:
     learn_cutoff_frequency: Optional[bool] = None  # noqa: UP045
     """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds, and
     pixels are not blind after events, which misleads it."""
-    least_delay: tyro.conf.Suppress[Optional[float]] = None  # noqa: UP045
-    """Delay (ms) of the photoreceptor that matters; one that is learned to be less is left out. None: any."""
+    least_delay: Optional[float] = None  # noqa: UP045
+    """Delay (ms) of the photoreceptor that matters; one that is learned to be less after 200 steps is left out. None: a
+    twentieth of the median time between a pixel's events; any, where a flag has the cut-off frequency learned."""
     second_cutoff_frequency: Optional[float] = None  # noqa: UP045
     """Cut-off frequency (Hz) of a second stage behind the photoreceptor, the same at any brightness. None: there is
     none."""
