@@ -6,6 +6,7 @@ import warnings
 
 KNOWN_WARNINGS = (
     (FutureWarning, r"`torch\.cuda\.amp\.\w+\(args\.\.\.\)` is deprecated", r"nerfstudio\."),
+    (UserWarning, r"Converting a tensor with requires_grad=True to a scalar", r"nerfstudio\.utils\.writer"),
     (UserWarning, r"Using a non-tuple sequence for multidimensional indexing", r"nerfstudio\.cameras\."),
 )
 """Category, beginning of the message, and the modules that it comes from, as regular expressions."""
