@@ -483,7 +483,7 @@ class _Resolver:
             if part == "bandwidth" and kept and index is not None and attrgetter(name)(self.config) is None:
                 found = LEAST_LAG * median_interval(index)
                 least = self.use("model.sensor.least_delay", lambda found=found: found)
-                value += f", and left out if it is less than {least:.2g} ms"
+                value += f", and left out if it is less than {least:.2g} ms" if least else ""
             self.row(part, self.use_events and bool(kept or given), value, why, name)
 
         name = "model.sensor.second_cutoff_frequency"

@@ -64,8 +64,9 @@ class SensorModelConfig:
     """Learn the cut-off frequency, starting from it. None: where the recording does not state the thresholds, and
     pixels are not blind after events, which misleads it."""
     least_delay: Optional[float] = None  # noqa: UP045
-    """Delay (ms) of the photoreceptor that matters; one that is learned to be less after 200 steps is left out. None: a
-    twentieth of the median time between a pixel's events; any, where a flag has the cut-off frequency learned."""
+    """Delay (ms) of the photoreceptor that matters; one that is learned to be less after 200 steps is left out. 0: any
+    matters. None: a twentieth of the median time between a pixel's events; 0 where a flag has the cut-off frequency
+    learned."""
     second_cutoff_frequency: Optional[float] = None  # noqa: UP045
     """Cut-off frequency (Hz) of a second stage behind the photoreceptor, the same at any brightness. None: there is
     none."""
@@ -205,7 +206,7 @@ class SensorModel(nn.Module):
         Returns:
             A sentence that says so; None where there is nothing to say.
         """
-        if not self.learns_lag or float(self.delay) >= self.least_delay:
+        if not (self.learns_lag and self.least_delay) or float(self.delay) >= self.least_delay:
             return None
         found = max(float(self.delay), 0.0)
         torch.as_tensor(self.delay).zero_()

@@ -33,7 +33,8 @@ class ThresholdMap(nn.Module):
     0, since that belongs to the sensor's thresholds. What a pixel's own events tell of the difference of both
     deviations (`start_from`) is one more equation.
 
-    Nothing here has a gradient or a learning rate; everything is stored with the run.
+    Nothing here has a gradient or a learning rate; everything is stored with the run, but for what it started from,
+    which whoever trains tells it again.
 
     Args:
         num_pixels: Of the sensor.

@@ -206,6 +206,7 @@ LAGS: dict[str, tuple[float, dict[str, Any], bool, bool]] = {
     "small": (0.04, {"learn_cutoff_frequency": True, "least_delay": 0.05}, False, False),
     "large": (0.06, {"learn_cutoff_frequency": True, "least_delay": 0.05}, True, True),
     "below 0": (-0.1, {"learn_cutoff_frequency": True, "least_delay": 0.05}, False, False),
+    "any, below 0": (-0.1, {"learn_cutoff_frequency": True}, True, True),
     "any": (0.001, {"learn_cutoff_frequency": True}, True, True),
     "small, with a second stage": (
         0.04, {"learn_cutoff_frequency": True, "least_delay": 0.05, "second_cutoff_frequency": 30.0}, False, True,
