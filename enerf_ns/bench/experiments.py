@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from enerf_ns.bench import published
-from enerf_ns.bench.published import PSNR_SSIM_LPIPS, Published
+from enerf_ns.bench.experiment import Experiment, Row, Sequence
+from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED, REAL
 from enerf_ns.paper_selections import SPIRAL_1
 from enerf_ns.published_losses import PUBLISHED_LOSSES
 
@@ -17,67 +16,6 @@ if TYPE_CHECKING:
 
 PARSER, DATA, MODEL = "pipeline.datamanager.dataparser.", "pipeline.datamanager.", "pipeline.model."
 SENSOR = MODEL + "sensor."
-
-
-@dataclass(frozen=True)
-class Row:
-    """One way to learn: what it changes of the method, by the names of ns-train's flags."""
-
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    factors: Mapping[str, float] = field(default_factory=dict)
-    """By how much settings are multiplied whose value is chosen from the recording."""
-    method: str | None = None
-    """Method of ns-train. None: that of the bench."""
-    reconstruction: Literal["e2vid", "filter"] | None = None
-    """What reconstructs, from events alone, the frames that are learnt from; None: they are the recording's own."""
-    known_sensor: bool = False
-    """Whether it is told what the sequence simulates of the sensor."""
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """What is learnt from: a recording that is simulated, or one that the user has."""
-
-    scene: str | None = None
-    """What `enerf simulate` shows. None: the recording is the folder of this sequence's name in --data, or --data."""
-    preset: str | None = None
-    """The paper's selections that are used."""
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    """As of `Row`."""
-    simulation: Mapping[str, Any] = field(default_factory=dict)
-    """Further settings of the simulation."""
-    sensor: Mapping[str, Any] | None = None
-    """Settings of the simulated sensor, of which the recording then states nothing. None: ideal, and stated."""
-    files: Mapping[str, str] = field(default_factory=dict)
-    """Text by the names of the files that scene and key_frames name."""
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A table: each row on each sequence."""
-
-    sentence: str
-    """What is compared."""
-    rows: tuple[str, ...]
-    sequences: tuple[str, ...] = ()
-    """Sequences that are simulated."""
-    recorded: tuple[str, ...] = ()
-    """Sequences within --data, which take the place of the simulated ones where it is given."""
-    columns: tuple[str, ...] = PSNR_SSIM_LPIPS
-    """Scores that are shown, the one that rows are ordered by first."""
-    protocols: tuple[str, ...] = ("log-affine-set",)
-    """How scores are measured; what is published beside them is of the first."""
-    measures: tuple[str, ...] = ()
-    """Names of further `measures.MEASURES` of each run."""
-    parts: bool = False
-    """Whether the numerical errors of the parts of each run are told, too."""
-    mean: bool = False
-    """Whether means over the sequences are shown instead of the sequences."""
-    published: Published = field(default_factory=dict)
-    source: str = "the paper"
-    """Who published it."""
-    notes: tuple[str, ...] = ()
-    """What a reader has to know to compare, one sentence each."""
 
 
 FRAMES = {DATA + "supervision": "frames"}
@@ -282,6 +220,8 @@ SEQUENCES: dict[str, Sequence] = {
         files={"unbounded.json": json.dumps(UNBOUNDED_SCENE), "unbounded.txt": UNBOUNDED_PATH},
     ),
     **SENSORS,
+    **CHOSEN_ON,
+    **ONLY_SCORED,
     "recording": Sequence(),
     "slider_depth": Sequence(),
     **{name: Sequence() for name in published.UZH},
@@ -431,6 +371,20 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=published.TUM_VIE,
         source="GPERT",
         notes=("Here frames and time range are those of E-NeRF's configs; GPERT's are those of Robust e-NeRF.",),
+    ),
+    "validation": Experiment(
+        "Recordings that differ in what matters, by which defaults are chosen and held to account.",
+        ("events", "nerf-sharp"),
+        (*CHOSEN_ON, *ONLY_SCORED),
+        recorded=(REAL,),
+        beside=True,
+        columns=("psnr", "ssim", "event_correlation", "depth_rmse", "brightness_scale"),
+        measures=("events",),
+        notes=(
+            f"Settings may be chosen by looking at {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are "
+            "only ever scored.",
+            "nerf-sharp learns from sharp frames alone: the ceiling of the field, sampler and renderer.",
+        ),
     ),
     "parts": Experiment(
         "Numerical error of the parts, which tells what limits a result: quadrature, poses, float32, brightness fit.",

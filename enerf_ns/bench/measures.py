@@ -160,6 +160,13 @@ def _map_correlation(sensor: SensorModel, recording: Path) -> dict[str, float]:
     return {f"threshold_map_{name}": float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) for name, a, b in pairs if a.std()}
 
 
+def _events(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
+    """How well held-out events are rendered, as far as that can be told, and the scale of the brightness fit."""
+    found = {name: score for name, score in run.pipeline.event_scores().items() if not isinstance(score, str)}
+    scale = aligned_views(views)[1].get("brightness_scale")
+    return found if scale is None else {**found, "brightness_scale": scale}
+
+
 def milliseconds_a_step(run: Run) -> float:
     """Of the training of a run."""
     assert run.train_seconds is not None
@@ -177,5 +184,6 @@ MEASURES: dict[str, Callable[[Run, Sequence[HeldOutView]], dict[str, float]]] = 
     "memory": _memory,
     "step": _step,
     "sensor": _sensor,
+    "events": _events,
 }
 """What is told beside scores, by name."""

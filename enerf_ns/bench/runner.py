@@ -86,9 +86,10 @@ class Bench:
             raise FlagError(f"--data changes nothing for {name}, whose sequences are simulated; leave it out.")
         if settings.data is None and not experiment.sequences:
             raise FlagError(f"enerf bench {name} needs --data: the folder of {', '.join(experiment.recorded)}.")
-        self.sequences = _some(
-            "sequences", settings.sequences, experiment.recorded if of_data else experiment.sequences
-        )
+        there = experiment.recorded if of_data else experiment.sequences
+        if experiment.beside and of_data:
+            there = (*experiment.sequences, *experiment.recorded)
+        self.sequences = _some("sequences", settings.sequences, there)
         rows = _some("rows", settings.rows, experiment.rows)
         self.left_out = {
             row: "--reconstruction-weights names no file with the weights of a network"
@@ -305,7 +306,7 @@ class Bench:
         """Where the user has a recording."""
         assert self.settings.data is not None
         data = absolute(self.settings.data)
-        return data / cell.sequence if (data / cell.sequence).is_dir() or len(self.sequences) > 1 else data
+        return data / cell.sequence if (data / cell.sequence).is_dir() or len(self.experiment.recorded) > 1 else data
 
     def _recording(self, cell: Cell) -> Path:
         """The recording that a cell is trained on, made where it is not there."""
