@@ -131,6 +131,21 @@ class Camera:
         """
         return self._pixel_directions.copy()
 
+    def pixel_steps(self) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
+        """By how much `pixel_directions` (x, y) change from a column to the next, and from a row to the next.
+
+        By central differences, which for a camera without distortion are exact.
+        """
+        directions = self._pixel_directions[..., :2]
+
+        def step(axis: int, of_one: tuple[float, float]) -> np.ndarray:
+            count = directions.shape[axis]
+            if count == 1:
+                return np.full_like(directions, of_one)
+            return np.gradient(directions, axis=axis, edge_order=2 if count > 2 else 1)
+
+        return step(1, (1 / self.fx, 0)), step(0, (0, 1 / self.fy))
+
     @cached_property
     def _pixel_directions(self) -> np.ndarray:
         if self.directions is not None:

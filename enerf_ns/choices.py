@@ -51,6 +51,9 @@ class MethodDefaults:
     event_pairs: int = 1024
     silent_pairs: int = 341
     train_num_rays_per_batch: int = 1024
+    instants: bool = True
+    """Whether half of all pairs are of any two instants, in place of silent ones, where the field learns from events
+    alone and pixels are never blind."""
     silent_pairs_beside_frames: int = 128
     """Silent pairs where the field learns from frames, too, which tell of plain surfaces as well."""
     rays_beside_events: int = 426
@@ -83,6 +86,9 @@ LONGEST_DISTANCE = 10
 
 MOST_NOISE = 0.1
 """Variance, in squared thresholds, of what noise adds to the events of a pair that is as far apart as any."""
+
+MOST_NOISE_BETWEEN = 1.0
+"""The same of pairs of any two instants, whose brightness is not known better than that."""
 
 LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "cutoff_frequency": 1.0}
 """Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that
@@ -348,9 +354,12 @@ class _Resolver:
             noise = f"; their noise adds {found:.2g} squared thresholds an event"
             self._frames_tell_more = self.use_frames and distance < LONGEST_DISTANCE
         more = self._frames_tell_more
-        pairs = self.use(
-            "datamanager.event_pairs", lambda: defaults.noisy_pairs_beside_frames if more else defaults.event_pairs
-        )
+        alone = mode == "partner" and defaults.instants and self.use_events and not self.use_frames and not blind
+        alone = alone and data.silent_pairs is None
+        both = defaults.event_pairs + defaults.silent_pairs
+        instants = self.use("datamanager.instant_pairs", lambda: (data.event_pairs or both // 2) if alone else 0)
+        usual = both - both // 2 if instants else defaults.event_pairs
+        pairs = self.use("datamanager.event_pairs", lambda: defaults.noisy_pairs_beside_frames if more else usual)
         distance = self.use("datamanager.max_pair_distance", lambda: distance)
         window = self.use("datamanager.window_ms", lambda: longest if mode == "accumulated" else DEFAULT_WINDOW_MS)
         if not self.use_events:
@@ -366,6 +375,31 @@ class _Resolver:
         if blind and mode != "successor":
             why += "; while pixels are blind after an event, only datamanager.pair-mode successor is exact"
         self.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why, "datamanager.supervision")
+        self._instants(instants, bool(blind))
+
+    def _instants(self, pairs: int, blind: bool) -> None:
+        """How far any two instants may be apart whose events are summed."""
+        name, value = "datamanager.instant_pairs", ""
+        apart = self.use("datamanager.instants_apart_ms", self._longest_worth_summing if pairs else lambda: 0.0)
+        if pairs:
+            value = f"{pairs} pairs a step, up to {apart:.3g} ms apart, whatever fired between them"
+        why = "between edges a ray sees what a pixel sees"
+        if blind:
+            why = "pixels that are blind after an event miss changes between their events"
+        elif self.use_frames:
+            why = "frames tell of what lies between edges"
+        elif not self.config.defaults.instants:
+            why = "the method does without"
+        self.row("any instants", bool(pairs), value, self.why(name, why), name)
+
+    def _longest_worth_summing(self) -> float:
+        """Time (ms) in which the noise of a pixel's events adds up to `MOST_NOISE_BETWEEN`; the whole recording at
+        most."""
+        index = index_events(self.recording)
+        first, last = index.span
+        a_pixel = len(index) / max(int((index.offsets.diff() > 0).sum()), 1)
+        share = min(max(2.0, MOST_NOISE_BETWEEN / max(self._noise.value, 1e-9)) / a_pixel, 1.0)
+        return max(1e-6 * (last - first) * share, 1e-6)
 
     def _silent_pixels(self) -> None:
         """Whether pixels that stay silent are learnt from, and how."""
@@ -386,6 +420,9 @@ class _Resolver:
         between = self.config.datamanager.silent_mode == "intervals"
         found = between or share > SMALLEST_SILENT_SHARE
         usual = defaults.silent_pairs_beside_frames if self.use_frames else defaults.silent_pairs
+        instants = self.config.datamanager.instant_pairs or self.values.get("datamanager.instant_pairs")
+        if instants:
+            usual = 0
         if self._frames_tell_more:
             usual = usual * defaults.noisy_pairs_beside_frames // defaults.event_pairs
         silent_pairs = self.use(name, lambda: usual if found else 0)
@@ -396,6 +433,8 @@ class _Resolver:
             why = "all pixels are silent between their events"
         if not defaults.silent_pairs:
             why = "the method does without"
+        elif instants:
+            why = "pairs of any instants tell of silence, too"
         self.row("silent pixels", bool(silent_pairs), value, self.why(name, why), name)
 
     @cached_property
@@ -713,7 +752,8 @@ class _Resolver:
 
     def _batch(self) -> None:
         """How many rays a step has, where neither the user nor a preset nor the paper says."""
-        names = [f"datamanager.{name}" for name in ("event_pairs", "silent_pairs", "train_num_rays_per_batch")]
+        numbers = ("event_pairs", "instant_pairs", "silent_pairs", "train_num_rays_per_batch")
+        names = [f"datamanager.{name}" for name in numbers]
         chosen = [name for name in names if name in self.values and name not in self.preset_values]
         if self.config.defaults.whole_preset or chosen != names:
             return

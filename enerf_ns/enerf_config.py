@@ -129,6 +129,7 @@ enerf_deblur = _with_losses("enerf-deblur")
 
 PAPER = MethodDefaults(
     event_pairs=30096,
+    instants=False,
     silent_pairs=0,
     train_num_rays_per_batch=30096,
     silent_pairs_beside_frames=0,

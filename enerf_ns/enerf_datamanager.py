@@ -9,7 +9,7 @@ from typing import Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro rea
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import all_dataparsers
@@ -33,6 +33,7 @@ from enerf_ns.events.samplers import (
     AccumulationSampler,
     EventPairSampler,
     HeldOutPairSampler,
+    InstantPairSampler,
     SilentIntervalSampler,
     SilentPixelSampler,
 )
@@ -76,6 +77,13 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     max_pair_distance: Optional[int] = None  # noqa: UP045
     """Events of the pixel that a partner may lie ahead, for pair-mode partner. None: as many as the noise of the events
     leaves worth adding up, at most 10."""
+    instant_pairs: Optional[int] = None  # noqa: UP045
+    """Pairs of any two instants of a pixel, drawn at each step beside those of events: what its events between them add
+    up to, if any. None: half of all pairs, in place of silent ones, where the field learns from events alone and pixels
+    are not blind after an event. 0: none."""
+    instants_apart_ms: Optional[float] = None  # noqa: UP045
+    """Longest time between the two instants of such a pair. None: as long as the noise of the events leaves worth
+    adding up."""
     window_ms: Optional[float] = None  # noqa: UP045
     """Length of the windows for pair-mode window, and of the longest for accumulated. None: 60; for accumulated a
     twentieth of the recording."""
@@ -113,8 +121,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     camera_optimizer: Fixed[Optional[CameraOptimizerConfig]] = None  # noqa: UP045
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before events were held out, too."""
-        self.__dict__.update({"held_out_events": 0.0, **state})
+        """Reads config.yml of runs from before events were held out, and before pairs of any instants, too."""
+        self.__dict__.update({"held_out_events": 0.0, "instant_pairs": 0, "instants_apart_ms": 0.0, **state})
 
 
 class EnerfDataManager(VanillaDataManager[EventDataset]):
@@ -141,6 +149,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             _ = (
                 self.pair_sampler,
                 self.silent_sampler,
+                self.instant_sampler,
                 self.held_out_pair_sampler,
             )  # so that what cannot be drawn is found before training
 
@@ -216,6 +225,16 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return SilentPixelSampler(self.index, *self._span, silence, silence, stretches, held_out)
 
     @cached_property
+    def instant_sampler(self) -> InstantPairSampler | None:
+        """Draws pairs of any two instants as the config says; None where it wants none."""
+        if not self.config.instant_pairs:
+            return None
+        assert self.config.instants_apart_ms is not None
+        return InstantPairSampler(
+            self.index, *self._span, max(1, round(self.config.instants_apart_ms * 1e6)), self._stretches
+        )
+
+    @cached_property
     def event_camera(self) -> PosedCamera:
         """The camera of the events, in the scene."""
         return self._posed(self.recording.camera, self.recording.trajectory)
@@ -256,10 +275,13 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             assert config.event_pairs is not None
             blind = sensor.refractory_period if sensor.lags else None
             events = self.pair_sampler.sample(config.event_pairs, self.generator, blind)
+            if self.instant_sampler is not None:
+                assert config.instant_pairs is not None
+                events = events.followed_by(self.instant_sampler.sample(config.instant_pairs, self.generator))
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)
-                events = events.with_silent(silent)
+                events = events.followed_by(silent)
         if "frames" in config.supervision:
             indices = self._frame_pixels(self._num_frame_pixels)
             instants = self._frame_instants(indices[:, 0])
@@ -290,13 +312,28 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             num_pairs=batch.num_pairs,
         )
 
-    def event_rays(self, batch: EventBatch, sensor: SensorModel) -> RayBundle:
-        """Rays of all first instants, from when the pixels can see, then of all second ones."""
+    def event_rays(
+        self, batch: EventBatch, sensor: SensorModel, places: Float[Tensor, "places 2"] | None = None
+    ) -> RayBundle:
+        """Rays of all first instants, from when the pixels can see, then of all second ones.
+
+        Args:
+            batch: Of pairs.
+            sensor: That made the events.
+            places: Where in its pixel rays go through, x and y from the centre in pixels: of each instant as many rays,
+                one after the other. None: the centre.
+        """
         delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
         if delays is not None:
             delays[batch.silent] = 0.0
             delays = torch.cat([delays, torch.zeros_like(delays)])
-        return self.event_camera.rays(batch.pixels.repeat(2), torch.cat([batch.start, batch.end]), delays)
+        pixels, times = batch.pixels.repeat(2), torch.cat([batch.start, batch.end])
+        if places is None:
+            return self.event_camera.rays(pixels, times, delays)
+        number = len(places)
+        delays = None if delays is None else delays.repeat_interleave(number)
+        pixels, times = (column.repeat_interleave(number) for column in (pixels, times))
+        return self.event_camera.rays(pixels, times, delays, places=places.repeat(2 * len(batch), 1))
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """Rays of pixels drawn evenly from the train cameras, as ns-export looks at a scene with; training itself takes
@@ -311,7 +348,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def get_train_rays_per_batch(self) -> int:
         """Rays of one training step, of events and frames together."""
         config = self.config
-        pairs = (config.event_pairs or 0) + (config.silent_pairs or 0) if "events" in config.supervision else 0
+        numbers = (config.event_pairs, config.instant_pairs, config.silent_pairs)
+        pairs = sum(number or 0 for number in numbers) if "events" in config.supervision else 0
         instants = self.config.exposure_samples or 1
         return 2 * pairs + (self._num_frame_pixels * instants if "frames" in config.supervision else 0)
 

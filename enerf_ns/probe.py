@@ -67,6 +67,7 @@ def _error(config: str, optimizer: str, device: str, view_direction: bool, seed:
     short.model.view_direction = view_direction
     manager = short.datamanager
     manager.event_pairs = min(manager.event_pairs or PAIRS, PAIRS)
+    manager.instant_pairs = min(manager.instant_pairs or 0, PAIRS)
     manager.silent_pairs = min(manager.silent_pairs or 0, PAIRS // 3)
     manager.train_num_rays_per_batch = min(manager.train_num_rays_per_batch or PAIRS, PAIRS)
     with torch.random.fork_rng():

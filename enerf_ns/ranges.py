@@ -62,6 +62,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "held_out_frame_indices": COUNT,
     "event_pairs": (1, MOST_DRAWS),
     "max_pair_distance": (1, 10**6),
+    "instant_pairs": (0, MOST_DRAWS),
+    "instants_apart_ms": (0.0, 1e9),
     "window_ms": (1e-6, 1e9),  # from 1 ns
     "silent_pairs": (0, MOST_DRAWS),
     "silent_pairs_beside_frames": (0, MOST_DRAWS),

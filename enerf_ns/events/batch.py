@@ -30,6 +30,9 @@ class EventBatch:
     rates: Float[Tensor, "pairs 2 2"] | None = None
     """Events a second around the first and the second instant of each pair, on and off (`samplers.rates_around`); None
     where nobody needs them."""
+    ahead: Float[Tensor, " pairs"] | None = None
+    """Thresholds by which log brightness changed more than the events between the instants say, as far as that is known
+    of instants that are no events. None: 0."""
     slopes: Float[Tensor, "pairs 2"] | None = None
     """By how much rendered log brightness changes a second at either instant, of the first pairs; 0 of the others. None
     where nobody needs it."""
@@ -52,20 +55,40 @@ class EventBatch:
         """Which pairs are of silent pixels."""
         return slice(len(self) - self.num_silent, None)
 
-    def with_silent(self, silent: EventBatch) -> EventBatch:
-        """A batch of these pairs, all of events, and then those of silent pixels."""
-        columns = zip(self.columns, silent.columns, strict=True)
+    def followed_by(self, others: EventBatch) -> EventBatch:
+        """A batch of these pairs, none of which is of a silent pixel, and then of others, whose instants are no events:
+        those of silent pixels, or of any instants."""
+        columns = zip(self.columns, others.columns, strict=True)
         joined = (torch.cat(both) for both in columns)
-        rates = None if self.rates is None else torch.cat([self.rates, self.rates.new_zeros(len(silent), 2, 2)])
-        return EventBatch(*joined, num_silent=len(silent), starts_at_events=self.starts_at_events, rates=rates)
+        rates = None if self.rates is None else torch.cat([self.rates, self.rates.new_zeros(len(others), 2, 2)])
+        ahead = None
+        if self.ahead is not None or others.ahead is not None:
+            parts = [
+                self.start.new_zeros(len(part)).float() if part.ahead is None else part.ahead for part in (self, others)
+            ]
+            ahead = torch.cat(parts)
+        return EventBatch(
+            *joined,
+            num_silent=others.num_silent,
+            starts_at_events=self.starts_at_events,
+            rates=rates,
+            ahead=ahead,
+        )
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
         num_silent = int(chosen[self.silent].sum())
-        rates, slopes = (None if column is None else column[chosen] for column in (self.rates, self.slopes))
+        rates, ahead, slopes = (
+            None if column is None else column[chosen] for column in (self.rates, self.ahead, self.slopes)
+        )
         return EventBatch(
-            *columns, num_silent=num_silent, starts_at_events=self.starts_at_events, rates=rates, slopes=slopes
+            *columns,
+            num_silent=num_silent,
+            starts_at_events=self.starts_at_events,
+            rates=rates,
+            ahead=ahead,
+            slopes=slopes,
         )
 
 

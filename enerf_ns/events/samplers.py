@@ -339,6 +339,80 @@ class SilentIntervalSampler:
         return self._draws.pairs(pairs, batch_size, generator)
 
 
+AHEAD = 0.15
+"""Thresholds by which log brightness has on average gone on since a pixel's last event, in the direction of that event:
+what is left of the change that fired it, and too little to fire again. Of simulated recordings it is 0.14 and 0.18
+(`benchmarks/instants.py`)."""
+
+
+class InstantPairSampler:
+    """Draws pairs of any two instants of a pixel, and what its events between them add up to.
+
+    A pair of events says exactly by how much the brightness of a pixel's area changed, but at instants at which an edge
+    goes through the pixel, where a ray through its centre sees something else. Instants that are drawn alike over time
+    mostly lie between edges. There a ray sees what the pixel sees, and the events up to then tell its brightness within
+    half a threshold (root mean square). What is left of that is on average in the direction of the last event:
+    `EventBatch.ahead`. Pairs are kept whether the pixel fired between their instants or not, since those that fired
+    alone would tell of more contrast than there is.
+
+    A pixel is drawn uniformly over the sensor, hot pixels left out, one instant over the recording, or its stretches,
+    and the other up to `max_duration_ns` before or after it; beyond the first or the last instant it is mirrored there,
+    and from between two stretches it is moved to the beginning of the next, or to the end of the last. Where pixels are
+    blind for a while after an event, what changes meanwhile is missing from the sum.
+
+    Args:
+        index: The events; batches come out on its device.
+        start_ns, end_ns: First and last instant that may be drawn.
+        max_duration_ns: At least 1.
+        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+
+    Raises:
+        ValueError: The duration is shorter than its minimum, or no stretch lies between start and end.
+    """
+
+    def __init__(
+        self,
+        index: EventIndex,
+        start_ns: int,
+        end_ns: int,
+        max_duration_ns: int,
+        stretches: Int64[Tensor, "stretches 2"] | None = None,
+    ):
+        if max_duration_ns < 1:
+            raise ValueError(f"Pairs of instants need a max_duration_ns of at least 1, not {max_duration_ns}.")
+        self.index = index
+        self.start_ns, self.end_ns = start_ns, end_ns
+        self.max_duration_ns = min(max_duration_ns, max(end_ns - start_ns, 1))
+        self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
+        self._stretches = None
+        if stretches is not None:
+            used = stretches[(stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)]
+            self._stretches = used.clamp(start_ns, end_ns)
+
+    def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
+        """Draws `batch_size` pairs; the generator lives on the device of the index."""
+        pixels, one, _, _ = self._moments.draw(batch_size, generator)
+        steps = torch.full_like(one, 2 * self.max_duration_ns + 1)
+        other = one + _randint(steps, generator) - self.max_duration_ns
+        other = torch.where(other < self.start_ns, 2 * self.start_ns - other, other)
+        other = torch.where(other > self.end_ns, 2 * self.end_ns - other, other)
+        if self._stretches is not None:
+            part = _part(other, self._stretches)
+            following = torch.cat([self._stretches[:, 0], self._stretches[-1:, 1]])
+            other = torch.where(part % 2 == 0, following[part // 2], other)
+        start, end = torch.minimum(one, other), torch.maximum(one, other)
+        begin = self.index.offsets[pixels]
+        until = [begin + self.index.count_until(pixels, time) for time in (start, end)]
+        on = _positives(self.index, until[1]) - _positives(self.index, until[0])
+        going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
+        ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
+        return EventBatch(pixels, start, end, on, until[1] - until[0] - on, starts_at_events=False, ahead=ahead)
+
+    def _is_on(self, until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
+        """Whether the last of so many first events of the index, of a pixel that has one, is an on event."""
+        return _positives(self.index, until) - _positives(self.index, (until - 1).clamp(min=0))
+
+
 class AccumulationSampler:
     """Draws pixels and windows of time, whose events are summed, as EventNeRF does (Rudnev et al., CVPR 2023).
 
@@ -415,12 +489,8 @@ class AccumulationSampler:
         start = (end - duration).clamp(min=first)
         until_start, until_end = (self.index.count_until(pixels, time) for time in (start, end))
         before = self.index.offsets[pixels]
-        on = self._positives(before + until_end) - self._positives(before + until_start)
+        on = _positives(self.index, before + until_end) - _positives(self.index, before + until_start)
         return EventBatch(pixels, start, end, on, until_end - until_start - on, starts_at_events=False)
-
-    def _positives(self, events: Int64[Tensor, " windows"]) -> Int64[Tensor, " windows"]:
-        """Number of positive events among so many first ones of the index."""
-        return torch.where(events > 0, self.index.positives[(events - 1).clamp(min=0)], 0).long()
 
 
 class _PixelMoments:
@@ -536,6 +606,11 @@ def _part(times: Int64[Tensor, "*times"], stretches: Int64[Tensor, "stretches 2"
     """Numbers of the parts that stretches cut time into: 0 before the first, 1 within it, 2 in the gap behind it ..."""
     begins, ends = stretches.T.contiguous()
     return torch.searchsorted(begins, times, right=True) + torch.searchsorted(ends, times)
+
+
+def _positives(index: EventIndex, events: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
+    """Number of positive events among so many first ones of the index."""
+    return torch.where(events > 0, index.positives[(events - 1).clamp(min=0)], 0).long()
 
 
 def _places(chosen: Bool[Tensor, " events"]) -> Int32[Tensor, " chosen"]:

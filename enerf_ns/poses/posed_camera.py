@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -48,8 +50,9 @@ class PosedCamera:
         times: Int64[Tensor, " rays"],
         delays: Float64[Tensor, " rays"] | None = None,
         corrections: Float[Tensor, "rays 6"] | None = None,
+        places: Float[Tensor, "rays 2"] | None = None,
     ) -> RayBundle:
-        """Rays through the centres of pixels, differentiable in `delays` and `corrections`.
+        """Rays through pixels, differentiable in `delays` and `corrections`.
 
         Args:
             pixels: Their numbers, y * width + x.
@@ -57,6 +60,7 @@ class PosedCamera:
             delays: ns that are added to the times, of any sign; with them a time can be learned. None: none.
             corrections: Of the poses, in the axes of the camera: a shift in metres, then a rotation vector in radians;
                 with them poses can be refined. None: none.
+            places: Where in its pixel each ray goes through, x and y from the centre in pixels. None: the centre.
 
         Returns:
             origins (rays, 3) in scene units; directions (rays, 3) of length 1; pixel_area (rays, 1); metadata
@@ -73,11 +77,24 @@ class PosedCamera:
             rotation = rotation @ correction[..., :3]
         rotation = self._transform[:, :3] @ rotation
         origins = self.scale * (position @ self._transform[:, :3].T + self._transform[:, 3])
-        directions = torch.einsum("nij,nj->ni", rotation.float(), self._directions[pixels])
+        towards, norms = self._directions[pixels], self._norms[pixels]
+        if places is not None:
+            right, down = self._steps
+            aside = places[:, :1] * right[pixels] + places[:, 1:] * down[pixels]
+            towards = towards * norms + torch.nn.functional.pad(aside, (0, 1))
+            norms = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+            towards = towards / norms
+        directions = torch.einsum("nij,nj->ni", rotation.float(), towards)
         area = 1.0 / (self.camera.fx * self.camera.fy)
         return RayBundle(
             origins=origins.float(),
             directions=directions,
             pixel_area=torch.full_like(origins[:, :1], area, dtype=torch.float32),
-            metadata={"directions_norm": self._norms[pixels]},
+            metadata={"directions_norm": norms},
         )
+
+    @cached_property
+    def _steps(self) -> tuple[Tensor, Tensor]:
+        """`Camera.pixel_steps`, a row for each pixel, on the device."""
+        right, down = (torch.from_numpy(step).float().view(-1, 2) for step in self.camera.pixel_steps())
+        return right.to(self._norms.device), down.to(self._norms.device)

@@ -175,6 +175,8 @@ class SensorModel(nn.Module):
             factors = self.threshold_map.factors(batch.pixels)
             on, off = on * factors[:, 0], off * factors[:, 1]
         change = on - off
+        if batch.ahead is not None:
+            change = change + 0.5 * (c_on + c_off) * batch.ahead
         if self.leaks:
             seconds = 1e-9 * (batch.end - batch.start).double()
             blind = self.blind_after(batch.start, batch.end) if batch.starts_at_events else None

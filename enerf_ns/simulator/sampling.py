@@ -15,7 +15,6 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.sensor.response import Logarithm, Response
 from enerf_ns.simulator.event_sensor import PartialPicture
-from enerf_ns.simulator.scene.render import pixel_steps
 
 MOTION_STEP = 1_000_000
 """Nanoseconds from one to the next of the poses between which displacements are measured."""
@@ -80,7 +79,7 @@ def render_times(
     lengths = np.linalg.norm(rays, axis=1)[:, None, None]
     units = rays[:, :, None] / lengths
     steps = np.zeros((len(rays), 3, 2))
-    for axis, step in enumerate(pixel_steps(camera)):
+    for axis, step in enumerate(camera.pixel_steps()):
         steps[:, :2, axis] = step[grid].reshape(-1, 2)
     pixels_per_unit = np.linalg.pinv((steps - units * (units * steps).sum(1, keepdims=True)) / lengths)
 

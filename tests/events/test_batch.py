@@ -14,7 +14,7 @@ def events(number: int, first: int, silent: bool) -> EventBatch:
 
 
 def test_silent_pairs_come_last():
-    joined = events(3, 0, False).with_silent(events(2, 100, True))
+    joined = events(3, 0, False).followed_by(events(2, 100, True))
     assert len(joined) == 5
     assert joined.pixels.tolist() == [0, 1, 2, 100, 101]
     assert joined.off.tolist() == [4, 5, 6, 104, 105]
@@ -22,15 +22,24 @@ def test_silent_pairs_come_last():
 
 
 def test_a_subset_knows_which_of_its_pairs_are_silent():
-    joined = events(3, 0, False).with_silent(events(2, 100, True))
+    joined = events(3, 0, False).followed_by(events(2, 100, True))
     subset = joined.subset(torch.tensor([True, False, True, False, True]))
     assert subset.pixels[subset.fired].tolist() == [0, 2] and subset.off[subset.silent].tolist() == [105]
 
 
 @pytest.mark.parametrize("at_events", [True, False])
 def test_a_batch_knows_whether_its_pairs_begin_at_events_whatever_becomes_of_it(at_events: bool):
-    joined = replace(events(3, 0, False), starts_at_events=at_events).with_silent(events(2, 100, True))
+    joined = replace(events(3, 0, False), starts_at_events=at_events).followed_by(events(2, 100, True))
     assert joined.starts_at_events == joined.subset(joined.off > 4).starts_at_events == at_events
+
+
+def test_what_is_known_beyond_the_events_stays_with_its_pairs():
+    some = replace(events(2, 100, False), ahead=torch.tensor([0.25, -0.5]))
+    joined = events(3, 0, False).followed_by(some).followed_by(events(2, 200, True))
+    assert joined.ahead is not None and joined.ahead.tolist() == [0, 0, 0, 0.25, -0.5, 0, 0]
+    subset = joined.subset(torch.tensor([False, True, False, False, True, True, False])).ahead
+    assert subset is not None and subset.tolist() == [0, -0.5, 0]
+    assert events(3, 0, False).followed_by(events(2, 100, True)).ahead is None
 
 
 def frames_of(pixels: int, instants: int) -> FrameBatch:

@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from math import sin
 
 import numpy as np
@@ -19,6 +20,7 @@ from enerf_ns.events.samplers import (
     AccumulationSampler,
     EventPairSampler,
     HeldOutPairSampler,
+    InstantPairSampler,
     SilentIntervalSampler,
     SilentPixelSampler,
 )
@@ -644,3 +646,53 @@ def test_two_instants_of_a_silent_interval_are_uniform() -> None:
     expected = [(a, b) for a in range(1, 5) for b in range(a + 1, 5)]
     assert set(drawn) == set(expected)
     assert chisquare([drawn[pair] for pair in expected]).pvalue > 1e-3
+
+
+def level_after(events: list[tuple[int, int]], time: int) -> float:
+    """What a pixel's events up to a time add up to, and what is left of the last of them, in thresholds; by a loop."""
+    before = [polarity for t, polarity in events if t <= time]
+    return sum(before) + (event_sampler.AHEAD * before[-1] if before else 0.0)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("longest", [1, 90, 10**6])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+def test_pairs_of_any_instants_tell_what_the_events_between_add_up_to(equal_stamps, longest: int, gaps: bool, device):
+    pixels = recording(equal_stamps)
+    stretches = torch.tensor(STRETCHES, device=device) if gaps else None
+    sampler = InstantPairSampler(index_of(pixels, device), START, END, longest, stretches)
+    batch = sampler.sample(4000, torch.Generator(device).manual_seed(0))
+    assert batch.num_silent == 0 and not batch.starts_at_events and batch.ahead is not None
+    rows = zip(*(column.tolist() for column in (*batch.columns, batch.ahead)), strict=True)
+    for pixel, start, end, on, off, ahead in rows:
+        assert START <= start <= end <= END
+        assert not gaps or (stretch_of(start) is not None and stretch_of(end) is not None)
+        gap = max(b[0] - a[1] for a, b in pairwise(STRETCHES)) if gaps else 0
+        assert end - start <= longest + gap
+        between = [polarity for t, polarity in pixels[pixel] if start < t <= end]
+        assert (on, off) == (between.count(1), between.count(-1))
+        told = level_after(pixels[pixel], end) - level_after(pixels[pixel], start) if between else 0.0
+        assert on - off + ahead == pytest.approx(told, abs=1e-6)
+
+
+def test_any_instants_are_drawn_alike_over_pixels_and_time():
+    sampler = InstantPairSampler(index_of(recording(False)), START, END, 10**6)
+    batch = sampler.sample(60_000, torch.Generator().manual_seed(0))
+    assert chisquare(torch.bincount(batch.pixels, minlength=WIDTH * HEIGHT)).pvalue > 1e-3
+    times = torch.cat([batch.start, batch.end])
+    assert chisquare(torch.histc(times.double(), 19, START, END + 1)).pvalue > 1e-3
+    fired = (batch.on + batch.off > 0).double().mean()
+    assert 0.1 < fired < 0.9, "pairs are kept whether the pixel fired between them or not"
+
+
+def test_any_instants_repeat_with_their_seed_and_leave_hot_pixels_out():
+    index = replace(index_of(recording(False)), hot_pixels=torch.tensor([3, 4]))
+    sampler = InstantPairSampler(index, START, END, 90)
+    one, other = (sampler.sample(2000, torch.Generator().manual_seed(7)) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(one.columns, other.columns, strict=True))
+    assert not {3, 4} & set(one.pixels.tolist())
+
+
+def test_instants_that_are_no_time_apart_are_refused():
+    with pytest.raises(ValueError, match="max_duration_ns"):
+        InstantPairSampler(index_of(recording(False)), START, END, 0)

@@ -90,7 +90,7 @@ class Drawn:
 
     def batch(self, sensor: SensorModel) -> EventBatch:
         pairs = self._pairs.sample(512, self._generator, sensor.refractory_period if sensor.lags else None)
-        return pairs.with_silent(self._silent.sample(128, self._generator, sensor.refractory_period))
+        return pairs.followed_by(self._silent.sample(128, self._generator, sensor.refractory_period))
 
 
 def learn(

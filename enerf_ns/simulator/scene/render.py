@@ -45,14 +45,15 @@ class Renderer:
     Args:
         scene: What to render.
         camera: Of any model.
+        places: Where in a pixel it is looked, x and y from its centre in pixels; 1, 4, 16 or 64 places.
 
     Raises:
         ValueError: The distortion of the camera has no inverse at some pixel.
     """
 
-    def __init__(self, scene: Scene, camera: Camera):
+    def __init__(self, scene: Scene, camera: Camera, places: Float64[np.ndarray, "places 2"] = SAMPLES):
         self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
-        self._samples, self._centres = _Samples.of(camera, SAMPLES), _Samples.of(camera, CENTRE)
+        self._samples, self._centres = _Samples.of(camera, places), _Samples.of(camera, CENTRE)
 
     def brightness(
         self, pose: Float64[np.ndarray, "3 4"], pixels: Int64[np.ndarray, " pixels"] | None = None
@@ -107,7 +108,7 @@ class _Samples:
     @classmethod
     def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> _Samples:
         """Samples at these offsets from the centre of every pixel, x and y in pixels; 1, 4, 16 or 64 of them."""
-        directions, (right, down) = camera.pixel_directions(), pixel_steps(camera)
+        directions, (right, down) = camera.pixel_directions(), camera.pixel_steps()
         sizes = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) * GROUP / len(offsets))
         side = round((BLOCK / len(offsets)) ** 0.5)
         rows, columns = -(-camera.height // side), -(-camera.width // side)
@@ -162,22 +163,6 @@ class _Samples:
         nodes = nodes[kept]
         nodes[:, 1] = followers[nodes[:, 1]]
         return nodes, bounds[kept]
-
-
-def pixel_steps(camera: Camera) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
-    """By how much directions (x, y, 1), camera axes, change from a column to the next and from a row to the next.
-
-    By central differences, which for a camera without distortion are exact.
-    """
-    directions = camera.pixel_directions()[..., :2]
-
-    def step(axis: int, of_one: tuple[float, float]) -> np.ndarray:
-        count = directions.shape[axis]
-        if count == 1:
-            return np.full_like(directions, of_one)
-        return np.gradient(directions, axis=axis, edge_order=2 if count > 2 else 1)
-
-    return step(1, (1 / camera.fx, 0)), step(0, (0, 1 / camera.fy))
 
 
 @compiled

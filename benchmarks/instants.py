@@ -1,0 +1,112 @@
+"""What events say of the brightness that rays see: at events, and at any instant, of scenes that are known.
+
+Simulates recordings of an ideal sensor, draws pairs of instants as training does, renders the true scene at both, over
+the area of each pixel and through its centre alone, and compares the changes with what the events say. Prints for each
+the correlation, and the error in contrast thresholds (root mean square), of all pairs, and how far brightness has gone
+on since the last event (`enerf_ns.events.samplers.AHEAD`).
+
+    python benchmarks/instants.py
+    python benchmarks/instants.py floor clutter statue
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.events.batch import EventBatch
+from enerf_ns.events.samplers import EventPairSampler, InstantPairSampler
+from enerf_ns.sensor.response import response_named
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.scene.render import SAMPLES, Renderer
+from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.sources import RenderedScene
+from enerf_ns.simulator.view import view_of
+
+PAIRS, DISTANCE, APART_NS = 2500, 10, 100_000_000
+THRESHOLD = 0.2
+CENTRE = np.tile([[0.0, 0.0]], (4, 1)) + 1e-6 * np.arange(4)[:, None]
+"""Four places that are one, since the renderer takes its samples by fours."""
+
+
+def main() -> None:
+    names = sys.argv[1:] or ["shapes", "floor", "clutter"]
+    print("| scene | instants | ray | correlation | error, thresholds | gone on since the last event, thresholds |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name in names:
+        with tempfile.TemporaryDirectory() as folder:
+            settings = settings_of(name, Path(folder))
+            simulate(settings, Path(folder) / "recording")
+            index = index_events(read_recording(Path(folder) / "recording"))
+            scene = view_of(settings, []).events
+        assert isinstance(scene, RenderedScene)
+        generator = torch.Generator().manual_seed(0)
+        batches = {
+            "events": EventPairSampler(index, "partner", DISTANCE).sample(PAIRS, generator),
+            "any": InstantPairSampler(index, *index.span, APART_NS).sample(PAIRS, generator),
+        }
+        for instants, batch in batches.items():
+            for ray, places in (("area", SAMPLES), ("centre", CENTRE)):
+                scene.renderer = Renderer(scene.renderer.scene, scene.camera, places)
+                change = changes(scene, settings, batch) / THRESHOLD
+                counted = (batch.on - batch.off).numpy().astype(float)
+                told = counted if batch.ahead is None else counted + batch.ahead.numpy()
+                going = 0.0 if batch.ahead is None else ahead(change - counted, batch.ahead.numpy())
+                print(
+                    f"| {name} | {instants} | {ray} | {np.corrcoef(change, told)[0, 1]:.3f} | "
+                    f"{np.sqrt(np.mean((change - told) ** 2)):.2f} | {going:.2f} |".replace("| 0.00 |", "| - |"),
+                    flush=True,
+                )
+
+
+def settings_of(name: str, folder: Path) -> SimulationSettings:
+    """What `enerf bench validation` simulates of this name, or the scene of `enerf simulate`, with an ideal sensor."""
+    sequence = {**CHOSEN_ON, **ONLY_SCORED}.get(name)
+    thresholds = (THRESHOLD, THRESHOLD)
+    if sequence is None:
+        return SimulationSettings(name, layout="esim", contrast_thresholds=thresholds)
+    for file, content in sequence.files.items():
+        (folder / file).write_text(content)
+    given = {
+        key: value
+        for key, value in sequence.simulation.items()
+        if key not in ("key_frames", "contrast_thresholds", "colour", "bayer_pattern")
+    }
+    return SimulationSettings(
+        str(folder / f"{Path(sequence.scene or '').stem}.json"),
+        key_frames=folder / sequence.simulation["key_frames"],
+        layout="esim",
+        contrast_thresholds=thresholds,
+        **given,
+    )
+
+
+def changes(scene: RenderedScene, settings: SimulationSettings, batch: EventBatch) -> np.ndarray:
+    """True changes of log brightness between the instants of pairs."""
+    response = response_named(settings.sensor.response)
+    seen = [
+        np.array([
+            np.ravel(scene.brightness(time, np.array([pixel])))[0]
+            for time, pixel in zip(times.tolist(), batch.pixels.tolist(), strict=True)
+        ])
+        for times in (batch.start, batch.end)
+    ]  # fmt: skip
+    before, after = (response(brightness.astype(np.float64)) for brightness in seen)
+    return after - before
+
+
+def ahead(left: np.ndarray, told: np.ndarray) -> float:
+    """Thresholds by which brightness has gone on in the direction of the last event, by least squares."""
+    direction = np.sign(told) * np.round(np.abs(told) / np.abs(told[told != 0]).min())
+    return float((direction * left).sum() / (direction * direction).sum())
+
+
+if __name__ == "__main__":
+    main()
