@@ -214,6 +214,22 @@ def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float])
     return Estimate(float(growth.values[1]), float(growth.errors[1]), why)
 
 
+def scene_variance(index: EventIndex, contrast_thresholds: tuple[float, float], noise: float) -> float:
+    """Largest variance of a pixel's sum of events over any number of them, in squared mean thresholds, less what noise
+    adds: how far apart a pixel sees a scene's log brightness.
+
+    Args:
+        index: On the CPU.
+        contrast_thresholds: C_on and C_off; only their ratio matters.
+        noise: What noise adds to the variance of a sum with each event (`noise_per_event`).
+
+    Returns:
+        0 where pixels have too few events.
+    """
+    growth = _growth(index, contrast_thresholds, with_spread=False)
+    return 0.0 if growth is None else max(float((growth.variances - noise * growth.lengths).max()), 0.0)
+
+
 def threshold_differences(
     index: EventIndex, contrast_thresholds: tuple[float, float], noise: float
 ) -> tuple[Float32[Tensor, " pixels"], Float32[Tensor, " pixels"]]:
@@ -329,6 +345,10 @@ class _Growth:
     """Variance of the longest sums."""
     squares: float
     """What a squared spread of 1 would add to it."""
+    lengths: Int64[np.ndarray, " windows"]
+    """Numbers of events that are summed."""
+    variances: Float64[np.ndarray, " windows"]
+    """Variance of the sums of each number."""
 
 
 def _growth(index: EventIndex, contrast_thresholds: tuple[float, float], with_spread: bool) -> _Growth | None:
@@ -374,6 +394,8 @@ def _growth(index: EventIndex, contrast_thresholds: tuple[float, float], with_sp
         first=float(variance[0] / number[0]),
         variance=float(variance[-1] / number[-1]),
         squares=float(squares[-1] / number[-1]),
+        lengths=np.array(WINDOWS[: len(rows)]),
+        variances=variance / number,
     )
 
 

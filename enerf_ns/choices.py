@@ -29,6 +29,7 @@ from enerf_ns.dataparsers.sensor_estimates import (
     median_interval,
     noise_per_event,
     refractory_period,
+    scene_variance,
     threshold_spread,
 )
 from enerf_ns.enerf_datamanager import HELD_OUT_SPANS, EnerfDataManagerConfig
@@ -87,8 +88,9 @@ LONGEST_DISTANCE = 10
 MOST_NOISE = 0.1
 """Variance, in squared thresholds, of what noise adds to the events of a pair that is as far apart as any."""
 
-MOST_NOISE_BETWEEN = 1.0
-"""The same of pairs of any two instants, whose brightness is not known better than that."""
+MOST_NOISE_BETWEEN, NOISE_OF_SCENE = 1.0, 0.125
+"""The same of pairs of any two instants, whose brightness is not known much better; and what it may be as a share of
+the variance of the brightness that a pixel sees, where that is more."""
 
 LEARNED_WITHIN = {"threshold_ratio": 0.05, "leak_rate": 0.5, "cutoff_frequency": 1.0}
 """Largest standard errors (`errors_of_learning`) with which something is learned of an unknown sensor; a parameter that
@@ -393,12 +395,13 @@ class _Resolver:
         self.row("any instants", bool(pairs), value, self.why(name, why), name)
 
     def _longest_worth_summing(self) -> float:
-        """Time (ms) in which the noise of a pixel's events adds up to `MOST_NOISE_BETWEEN`; the whole recording at
-        most."""
-        index = index_events(self.recording)
+        """Time (ms) in which the noise of a pixel's events adds up to what is worth it; the whole recording at most."""
+        index, noise = index_events(self.recording), self._noise.value
         first, last = index.span
         a_pixel = len(index) / max(int((index.offsets.diff() > 0).sum()), 1)
-        share = min(max(2.0, MOST_NOISE_BETWEEN / max(self._noise.value, 1e-9)) / a_pixel, 1.0)
+        scene = scene_variance(index, self._balanced_thresholds, noise)
+        most = max(MOST_NOISE_BETWEEN, NOISE_OF_SCENE * scene)
+        share = min(max(2.0, most / max(noise, 1e-9)) / a_pixel, 1.0)
         return max(1e-6 * (last - first) * share, 1e-6)
 
     def _silent_pixels(self) -> None:

@@ -119,7 +119,8 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
     assert values["datamanager.dataparser.depth_range"] == simulated.depth_range
     assert values["model.sensor.response"] == "linlog" and values["model.sensor.bayer_pattern"] == "grey"
     assert values["datamanager.pair_mode"] == "partner" and values["model.num_channels"] == 1
-    assert values["datamanager.event_pairs"] == 1024 and values["datamanager.silent_pairs"] == 341
+    assert values["datamanager.event_pairs"] + values["datamanager.instant_pairs"] == 1024 + 341
+    assert values["datamanager.instant_pairs"] == 682 and values["datamanager.silent_pairs"] == 0
     paper = resolve(PAPER, read_recording(recording)).values
     assert paper["datamanager.event_pairs"] == 30096 and paper["datamanager.silent_pairs"] == 0
     assert paper["model.event_loss"] == "squared" and "datamanager.pair_mode" not in paper
@@ -127,16 +128,56 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
 
 
 def test_frames_take_no_more_rays_of_a_step_than_silent_pixels_give_up(recording: Path):
-    def drawn(config, supervision: str) -> tuple[int, int]:
+    def drawn(config, supervision: str) -> tuple[int, int, int]:
         config = copy.deepcopy(config)
         config.datamanager.supervision = supervision
         values = resolve(config, read_recording(recording)).values
-        return values["datamanager.silent_pairs"], values["datamanager.train_num_rays_per_batch"]
+        beside = values["datamanager.instant_pairs"] + values["datamanager.silent_pairs"]
+        return values["datamanager.event_pairs"], beside, values["datamanager.train_num_rays_per_batch"]
 
     alone, both = drawn(ENERF, "events"), drawn(ENERF, "events+frames")
-    assert 2 * alone[0] == 2 * both[0] + both[1] and both[1] > 0 < both[0]
-    assert drawn(ENERF, "frames") == (0, 1024)
-    assert drawn(PAPER, "events+frames") == (0, 30096)
+    assert 2 * sum(alone[:2]) == 2 * sum(both[:2]) + both[2] and both[1] > 0 < both[2]
+    assert drawn(ENERF, "frames")[1:] == (0, 1024)
+    assert drawn(PAPER, "events+frames")[1:] == (0, 30096)
+
+
+def test_any_instants_are_paired_where_events_alone_are_learnt_from_and_pixels_see_all(recording: Path):
+    def chosen(**changes: Any) -> Resolution:
+        config = copy.deepcopy(ENERF)
+        for name, value in changes.items():
+            part, field = name.split("__")
+            owner = {"data": config.datamanager, "sensor": config.model.sensor}[part]
+            setattr(owner, field, value)
+        return resolve(config, read_recording(recording))
+
+    def pairs(**changes: Any) -> int:
+        return chosen(**changes).values.get("datamanager.instant_pairs", changes.get("data__instant_pairs"))
+
+    assert pairs() == 682 and pairs(data__event_pairs=100) == 100 and pairs(data__instant_pairs=7) == 7
+    assert chosen(data__instant_pairs=0).values["datamanager.silent_pairs"] == 341
+    for what, changes in {
+        "frames": {"data__supervision": "events+frames"},
+        "blind": {"sensor__refractory_period_ns": 8_000_000},
+    }.items():
+        row = rows(chosen(**changes))["any instants"]
+        assert pairs(**changes) == 0 and not row.kept and what in row.why
+    assert pairs(data__silent_pairs=5) == pairs(data__pair_mode="window") == 0
+    assert resolve(PAPER, read_recording(recording)).values["datamanager.instant_pairs"] == 0
+
+
+def test_any_instants_are_the_less_far_apart_the_noisier_events_are(recording: Path):
+    apart = {}
+    for name, polarity in {
+        "regular": np.broadcast_to(np.where(np.arange(96) % 2, 1, -1)[:, None], (96, WIDTH * HEIGHT)),
+        "noisy": np.random.default_rng(0).choice([-1, 1], (96, WIDTH * HEIGHT)),
+    }.items():
+        config = copy.deepcopy(ENERF)
+        config.model.sensor.refractory_period_ns = 0
+        unknown = of_unknown_sensor(recording, polarity)
+        apart[name] = resolve(config, unknown).values["datamanager.instants_apart_ms"]
+        first, last = index_events(unknown).span
+        assert apart[name] <= 1e-6 * (last - first)
+    assert apart["noisy"] < 0.5 * apart["regular"]
 
 
 def test_thresholds_that_nobody_states_come_from_the_counts(recording: Path, tmp_path: Path):
@@ -353,6 +394,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "held-out events": (0.1, 0.0),
         "event loss": ("events", "frames"),
         "silent pixels": (7, 0),
+        "any instants": (7, 0),
         "threshold per polarity": ((0.2, 0.3), (0.2, 0.2)),
         "threshold map": (True, False),
         "refractory period": (1000, 0),

@@ -38,7 +38,7 @@ def test_timing_a_step_changes_nothing(recording: Path, tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
-    [({}, (8, 8)), ({"event_pairs": 100}, (None, 1)), ({"silent_pairs": 0}, (1, None))],
+    [({}, (8, 8)), ({"event_pairs": 100}, (None, 1)), ({"silent_pairs": 0}, (1, 1))],
     ids=["all open", "pairs set", "silent pairs set"],
 )
 def test_only_what_nobody_set_is_larger(recording: Path, changes: dict[str, Any], expected: tuple):
@@ -48,7 +48,7 @@ def test_only_what_nobody_set_is_larger(recording: Path, changes: dict[str, Any]
     config.datamanager.dataparser.data = recording
     read = read_recording(recording)
     usual, larger = resolve(config, read), resolve(config, read, batch_factor=lambda filled: 8)
-    for name, factor in zip(("event_pairs", "silent_pairs"), expected, strict=True):
+    for name, factor in zip(("event_pairs", "instant_pairs"), expected, strict=True):
         name = f"datamanager.{name}"
         assert larger.values.get(name) == (None if factor is None else factor * usual.values[name])
     assert [choice.part for choice in larger.choices if choice.kept].count("larger batch") == (8 in expected)

@@ -124,6 +124,7 @@ ROWS: dict[str, Row] = {
     "events-30096-pairs": Row({DATA + "event_pairs": 30096}),
     "successor-pairs": Row({DATA + "pair_mode": "successor"}),
     "window-pairs": Row({DATA + "pair_mode": "window"}),
+    "without-instants": Row({DATA + "instant_pairs": 0}),
     "no-silent-pairs": Row({DATA + "silent_pairs": 0}),
     "uniform-samples": Row({MODEL + "sampling": "uniform", MODEL + "num_samples": 64}),
     "no-distortion-loss": Row({MODEL + "distortion_loss_weight": 0.0}),
@@ -374,7 +375,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "validation": Experiment(
         "Recordings that differ in what matters, by which defaults are chosen and held to account.",
-        ("events", "nerf-sharp"),
+        ("events", "without-instants", "nerf-sharp"),
         (*CHOSEN_ON, *ONLY_SCORED),
         recorded=(REAL,),
         beside=True,
@@ -383,6 +384,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=(
             f"Settings may be chosen by looking at {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are "
             "only ever scored.",
+            "without-instants pairs events with events, and looks at silent pixels, as all of enerf did before.",
             "nerf-sharp learns from sharp frames alone: the ceiling of the field, sampler and renderer.",
         ),
     ),

@@ -27,7 +27,7 @@ from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
 from enerf_ns.bench.measures import TRUTH, evaluate
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.bench.tables import csv_table, markdown
+from enerf_ns.bench.tables import csv_table, lines, markdown
 from enerf_ns.dataparsers.errors import FlagError, OutputError
 from enerf_ns.dataparsers.files import absolute, expanded, partial_of, read_json, write_whole
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
@@ -101,6 +101,8 @@ class Bench:
         if weights is not None and not expanded(weights).is_file():
             raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
         parse_budget(settings.budget)
+        self.before = _results_of(settings.against)
+        """What --against holds; None where it is not given."""
         if not 0.0 < settings.scale <= 4.0:
             raise FlagError(f"--scale is {settings.scale:g}, but must be above 0 and at most 4.")
         if settings.seeds < 1:
@@ -183,7 +185,7 @@ class Bench:
         """The command that makes the same, wherever the data lie."""
         words, default = ["enerf", "bench", self.name], BenchSettings()
         for name, value in vars(self.settings).items():
-            if name in ("output_dir", "threads") or (
+            if name in ("output_dir", "threads", "against") or (
                 value == getattr(default, name) and name not in ("budget", "scale")
             ):
                 continue
@@ -355,6 +357,28 @@ class Bench:
             raise OutputError(
                 f"{path} could not be written ({error.strerror}); make room, or give another --output-dir."
             ) from error
+
+
+def _results_of(against: Path | None) -> dict[str, Any] | None:
+    """The results that a file holds.
+
+    Raises:
+        FlagError: It holds none.
+    """
+    if against is None:
+        return None
+    try:
+        found = json.loads(expanded(against).read_text())
+        table = lines(found)
+    except OSError as error:
+        raise FlagError(
+            f"--against {against} cannot be read ({error.strerror}); give a result file (.json)."
+        ) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FlagError(f"--against {against} holds no results of enerf bench; give a result file (.json).") from error
+    if not table:
+        raise FlagError(f"--against {against} holds no runs; give a result file (.json) that has some.")
+    return found
 
 
 def parse_budget(budget: str) -> tuple[float, bool]:

@@ -29,5 +29,8 @@ class BenchSettings:
     """Weights of E2VID or FireNet, by which frames are reconstructed from events; without, that row is left out."""
     threads: Optional[int] = None  # noqa: UP045
     """Threads of the processor. None: as many as it has cores."""
+    against: Optional[Path] = None  # noqa: UP045
+    """Result file (.json) of another version: the change of each row is shown, worst first, and the exit code is not 0
+    where one lost more than 0.3 dB."""
     output_dir: Path = Path("outputs/bench")
     """Folder for the tables, recordings and runs; what is finished there is not run again."""

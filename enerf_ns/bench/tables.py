@@ -41,12 +41,16 @@ TITLES = {
     "megabytes_a_step": "MB a step",
     "forward_and_backward": "forward and backward",
     "brightness_scale": "scale",
+    "event_correlation": "correlation of held-out events",
     "threshold_ratio": "C_on / C_off",
     "refractory_ms": "blind, ms",
     "threshold_map_on": "map of C_on",
     "threshold_map_off": "map of C_off",
 }
 """Names of scores for a reader, where they are not their own."""
+
+LARGEST_LOSS = 0.3
+"""PSNR (dB, mean over the seeds) that a row may lose against another version."""
 
 LOWER_IS_BETTER = ("lpips", "lpips_vgg", "depth_rmse", "depth_rmse_all_poses", "near_depth_error", "ms_a_step")
 
@@ -102,6 +106,41 @@ def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
             values = [of_run[name] for of_run in scores if of_run.get(name) is not None]
             if len(values) == num_sequences:
                 line.scores.setdefault(name, []).append(mean(values))
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of a row since another version: means over the seeds of the PSNR, dB."""
+
+    sequence: str
+    row: str
+    before: float
+    now: float
+
+    @property
+    def loses(self) -> bool:
+        """Whether the row lost more than it may."""
+        return self.now < self.before - LARGEST_LOSS
+
+
+def changes_since(results: Results, before: Results) -> list[Change]:
+    """What became of each row that both tables have, worst first."""
+    then = {(line.sequence, line.row): line.scores["psnr"] for line in lines(before) if line.scores.get("psnr")}
+    now = {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
+    found = [Change(*key, mean(then[key]), mean(now[key])) for key in now if key in then]
+    return sorted(found, key=lambda change: change.now - change.before)
+
+
+def changes_table(changes: list[Change], file: str) -> Table:
+    """The table of `changes_since` for the terminal."""
+    table = Table(title=f"PSNR against {escape(file)}, worst first", title_justify="left")
+    for name in ("sequence", "row", "before, dB", "now, dB", "change"):
+        table.add_column(name, justify="left" if name in ("sequence", "row") else "right")
+    for change in changes:
+        mark = f"  more than {LARGEST_LOSS:g} dB lost" * change.loses
+        numbers = f"{change.before:.2f}", f"{change.now:.2f}", f"{change.now - change.before:+.2f}{mark}"
+        table.add_row(escape(change.sequence), escape(change.row), *numbers)
+    return table
 
 
 def _cells(results: Results) -> tuple[list[str], list[list[str]]]:

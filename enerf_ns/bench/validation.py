@@ -1,8 +1,8 @@
 """The validation set: recordings that differ in what matters, by which defaults are chosen and held to account.
 
 A default that is chosen on one scene may lose on others. So a change of one is taken only where no recording of
-`CHOSEN_ON` and of `ONLY_SCORED` loses more than `LARGEST_LOSS` (`enerf bench validation --against FILE`). Settings are
-chosen by looking at the first half alone; those of the second are only ever scored.
+`CHOSEN_ON` and of `ONLY_SCORED` loses more than `tables.LARGEST_LOSS` (`enerf bench validation --against FILE`).
+Settings are chosen by looking at the first half alone; the second is only ever scored.
 """
 
 from __future__ import annotations
@@ -10,13 +10,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from statistics import mean
 from typing import Any
 
 from enerf_ns.bench.experiment import Sequence as Recording
-
-LARGEST_LOSS = 0.3
-"""PSNR (dB, mean over the seeds) that a recording may lose against the table that it is compared with."""
 
 KEYS_PER_SECOND = 40
 """Key frames that paths here are sampled at."""
@@ -274,27 +270,3 @@ ONLY_SCORED: dict[str, Recording] = {
 
 REAL = "slider_depth"
 """A real recording beside the simulated ones, of those that defaults may be chosen by; it needs --data."""
-
-
-def losses(results: Mapping[str, Any], before: Mapping[str, Any]) -> list[tuple[str, str, float, float]]:
-    """By how much each recording changed against another table, the worst first.
-
-    Args:
-        results: What a result file of the validation set holds (`Bench.results`).
-        before: The same of another version.
-
-    Returns:
-        Sequence, row, PSNR before and PSNR now (dB, means over seeds), for what both hold.
-    """
-    now, then = _means(results), _means(before)
-    both = [(*key, then[key], now[key]) for key in now if key in then]
-    return sorted(both, key=lambda line: line[3] - line[2])
-
-
-def _means(results: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    protocol = results["protocols"][0]
-    values: dict[tuple[str, str], list[float]] = {}
-    for run in results["runs"]:
-        if "scores" in run:
-            values.setdefault((run["sequence"], run["row"]), []).append(run["scores"][protocol]["psnr"])
-    return {key: mean(of_seeds) for key, of_seeds in values.items()}

@@ -339,9 +339,9 @@ class SilentIntervalSampler:
         return self._draws.pairs(pairs, batch_size, generator)
 
 
-AHEAD = 0.15
+AHEAD = 0.2
 """Thresholds by which log brightness has on average gone on since a pixel's last event, in the direction of that event:
-what is left of the change that fired it, and too little to fire again. Of simulated recordings it is 0.14 and 0.18
+what is left of the change that fired it, and too little to fire again. Of simulated recordings it is 0.14 to 0.24
 (`benchmarks/instants.py`)."""
 
 

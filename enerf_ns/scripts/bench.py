@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.dataparsers.errors import printable
+from enerf_ns.dataparsers.errors import FlagError, printable
 
 CONSOLE = Console(width=140)
 
@@ -28,7 +28,7 @@ class Bench:
             CONSOLE.print(_experiments())
             return
         from enerf_ns.bench.runner import Bench as Runs
-        from enerf_ns.bench.tables import remarks, rich_table
+        from enerf_ns.bench.tables import LARGEST_LOSS, changes_since, changes_table, remarks, rich_table
 
         bench = Runs(self.experiment, self.settings)
         numbers = {cell: number for number, cell in enumerate(bench.cells, 1)}
@@ -48,6 +48,13 @@ class Bench:
         where = bench.output_dir / self.experiment
         drawn = "; error against time in .png" if where.with_suffix(".png").exists() else ""
         print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
+        if bench.before is not None:
+            changes = changes_since(told, bench.before)
+            CONSOLE.print(changes_table(changes, str(self.settings.against)))
+            lost = [f"{change.sequence}, {change.row}" for change in changes if change.loses]
+            if lost or not changes:
+                what = f"{'; '.join(lost)} lost more than {LARGEST_LOSS:g} dB" if lost else "No row is in both tables"
+                raise FlagError(f"{what} against {self.settings.against}.")
 
 
 def _experiments() -> Table:
