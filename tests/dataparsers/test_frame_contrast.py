@@ -11,7 +11,7 @@ from PIL import Image
 from waves import CAMERA, events_of_waves, recording_of
 
 from enerf_ns.dataparsers.frame_contrast import thresholds_from_frames
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording import EventRecording, Events
 
 FRAMES = np.arange(1, 40) * 25_000_000
 
@@ -75,3 +75,21 @@ def test_unrelated_frames_have_large_errors_or_tell_nothing(recording: EventReco
     shuffled = np.random.default_rng(0).permutation(len(frames.times))
     mixed = replace(frames, filenames=tuple(frames.filenames[i] for i in shuffled))
     assert thresholds_from_frames(replace(recording, frames=mixed), 0) is None
+
+
+def test_noise_of_the_events_does_not_make_them_worth_less(tmp_path: Path):
+    """As many events of either polarity by chance as of the waves: by least squares, each were worth much less."""
+    waves, rng = events_of_waves((0.28, 0.2), 1.0), np.random.default_rng(4)
+    number = len(waves.t)
+    chance = (
+        rng.integers(0, CAMERA.width, number),
+        rng.integers(0, CAMERA.height, number),
+        rng.integers(waves.t[0], waves.t[-1], number),
+        rng.choice([-1, 1], number),
+    )
+    columns = [np.concatenate(both) for both in zip((waves.x, waves.y, waves.t, waves.p), chance, strict=True)]
+    x, y, t, p = (column[np.argsort(columns[2], kind="stable")] for column in columns)
+    noisy = recording_of(Events(x, y, t, p.astype(np.int8)), tmp_path, FRAMES)
+    found = thresholds_from_frames(noisy, 0)
+    assert found is not None
+    np.testing.assert_allclose(found[0], (0.28, 0.2), rtol=0.15)

@@ -13,15 +13,20 @@ from enerf_ns.dataparsers.trajectory import Trajectory
 
 WIDTH, HEIGHT = 48, 36
 STEP = 250_000  # ns
+BLOCK = 4
+"""Side of the squares of pixels that see the same waves, each pixel a little later than the one before."""
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 50.0, 23.5, 17.5)
 
 
 def log_brightness(time: float) -> np.ndarray:
     """Log brightness of each pixel at a time (s), between that of 30 and of 220 grey levels; float64 [pixels]."""
     generator = np.random.default_rng(0)
-    shape = (3, WIDTH * HEIGHT)
-    frequency, phase = generator.uniform(0.5, 4.0, shape), generator.uniform(0, 2 * np.pi, shape)
-    size = generator.dirichlet(np.ones(3), WIDTH * HEIGHT).T
+    blocks = WIDTH // BLOCK * (HEIGHT // BLOCK)
+    frequency, phase = generator.uniform(0.5, 4.0, (3, blocks)), generator.uniform(0, 2 * np.pi, (3, blocks))
+    size = generator.dirichlet(np.ones(3), blocks).T
+    y, x = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    block = y // BLOCK * (WIDTH // BLOCK) + x // BLOCK
+    frequency, size, phase = frequency[:, block], size[:, block], phase[:, block] + 0.1 * (x + y)
     low, high = np.log(30 / 255), np.log(220 / 255)
     return (low + high) / 2 + (high - low) / 2 * (size * np.sin(2 * np.pi * frequency * time + phase)).sum(0)
 
