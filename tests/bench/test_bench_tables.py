@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from enerf_ns.bench.tables import csv_table, disagreements, markdown, rich_table
+from enerf_ns.bench.tables import changes_since, changes_table, csv_table, disagreements, markdown, rich_table
 
 
 def run(row: str, psnr: float | None, sequence: str = "shake", seed: int = 0, **changes: Any) -> dict[str, Any]:
@@ -183,3 +183,19 @@ def test_what_a_score_should_be_stands_in_brackets_where_it_is_known():
     runs += [run("learned", None, "other", scores={"log-affine-set": {"brightness_scale": 0.5}})]
     found = rows_of(markdown(results(*runs, columns=["brightness_scale"], published={})))
     assert [line[2] for line in found] == ["0.750 (0.800)", "0.500"]
+
+
+def test_what_became_of_each_row_since_another_version_stands_worst_first():
+    before = results(run("events", 25.0), run("events", 27.0, seed=1), run("frames", 20.0), run("gone", 20.0))
+    now = results(run("events", 25.65), run("events", 25.65, seed=1), run("frames", 25.0), run("new", 9.0))
+    changes = changes_since(now, before)
+    assert [(change.row, change.before, change.now) for change in changes] == [
+        ("events", 26.0, pytest.approx(25.65)),
+        ("frames", 20.0, 25.0),
+    ]
+    assert [change.loses for change in changes] == [True, False]
+    assert not changes_since(results(run("events", 25.71)), before)[0].loses, "less than 0.3 dB may be lost"
+    console = Console(width=140, record=True)
+    console.print(changes_table(changes, "before.json"))
+    told = console.export_text()
+    assert told.count("more than 0.3 dB lost") == 1 and "-0.35" in told and "+5.00" in told

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import mean
 
+import numpy as np
 import pytest
 
 from enerf_ns.bench import published
@@ -12,11 +13,15 @@ from enerf_ns.bench.experiments import EXPERIMENTS, FORCED_ON, LEFT_OUT, ROWS, S
 from enerf_ns.bench.measures import MEASURES
 from enerf_ns.bench.published import MEAN
 from enerf_ns.bench.tables import LOWER_IS_BETTER
+from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED, REAL
 from enerf_ns.evaluation.runs import method_config
 from enerf_ns.paper_selections import PRESETS
 from enerf_ns.simulator import paper_sequences
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.scenes import SCENES
+from enerf_ns.simulator.settings import SimulationSettings
+from enerf_ns.simulator.sources import RenderedScene
+from enerf_ns.simulator.view import view_of
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -82,3 +87,38 @@ def test_the_published_ablation_starts_from_the_published_events():
 def test_scores_of_which_less_is_better_are_told_from_the_others():
     columns = {experiment.columns[0] for experiment in EXPERIMENTS.values()}
     assert columns - set(LOWER_IS_BETTER) == {"psnr"}
+
+
+def test_the_validation_set_has_ten_recordings_of_which_half_are_only_scored():
+    experiment = EXPERIMENTS["validation"]
+    assert not set(CHOSEN_ON) & set(ONLY_SCORED) and len(CHOSEN_ON) + len(ONLY_SCORED) >= 10
+    assert len(ONLY_SCORED) >= len(CHOSEN_ON) and experiment.sequences == (*CHOSEN_ON, *ONLY_SCORED)
+    assert experiment.recorded == (REAL,) and experiment.beside
+    simulations = [sequence.simulation for sequence in (*CHOSEN_ON.values(), *ONLY_SCORED.values())]
+    sizes = {(simulation["width"], simulation["height"]) for simulation in simulations}
+    assert {(160, 120), (346, 260), (640, 480)} <= sizes
+    assert any("bayer_pattern" in simulation for simulation in simulations)
+    for half in (CHOSEN_ON, ONLY_SCORED):
+        sensors = [sequence.sensor for sequence in half.values()]
+        assert None in sensors and any(sensors), "both halves have ideal sensors and others"
+
+
+@pytest.mark.parametrize("name", [*CHOSEN_ON, *ONLY_SCORED])
+def test_every_recording_of_the_validation_set_shows_its_scene_all_along(name: str, tmp_path: Path):
+    """Rendered at the start, in the middle and at the end of its path, small; what is before nothing is in view."""
+    sequence = {**CHOSEN_ON, **ONLY_SCORED}[name]
+    for file, content in sequence.files.items():
+        (tmp_path / file).write_text(content)
+    given = {
+        **sequence.simulation,
+        "width": 40,
+        "height": 30,
+        "key_frames": tmp_path / sequence.simulation["key_frames"],
+    }
+    settings = SimulationSettings(str(tmp_path / str(sequence.scene)), layout="event_recording", **given)
+    scene = view_of(settings, []).events
+    assert isinstance(scene, RenderedScene)
+    for time in np.linspace(scene.start, scene.end, 3).astype(int).tolist():
+        depth = scene.depth(time)
+        assert (depth > 0).mean() > (0.1 if name == "statue" else 0.95)
+        assert scene.brightness(time).std() > 0.03

@@ -30,6 +30,7 @@ from enerf_ns.enerf_trainer import EnerfTrainer
 from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.runs import load, method_config
 from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.scripts.bench import Bench as BenchCommand
 from enerf_ns.sensor.threshold_map import ThresholdMap
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
@@ -80,6 +81,23 @@ def test_what_is_finished_is_not_run_again_and_gives_the_same_tables(finished: P
     assert finish(folder) == []
     assert {file: file.read_bytes() for file in folder.glob("design.*")} == written
     assert {file.suffix for file in written} == {".md", ".json", ".csv"}
+
+
+@pytest.mark.parametrize(("better", "fails"), [(-1.0, False), (0.0, False), (1.0, True)])
+def test_a_row_that_lost_against_another_version_is_an_error(finished: Path, tmp_path: Path, better, fails, capsys):
+    before = json.loads((finished / "design.json").read_text())
+    for of_run in before["runs"]:
+        for scores in of_run["scores"].values():
+            scores["psnr"] += better
+    (tmp_path / "before.json").write_text(json.dumps(before))
+    settings = BenchSettings(**{**SMALL_BENCH, "output_dir": finished, "against": tmp_path / "before.json"})
+    command = BenchCommand("design", settings)
+    if fails:
+        with pytest.raises(FlagError, match="lost more than 0.3 dB"):
+            command.main()
+    else:
+        command.main()
+    assert "worst first" in capsys.readouterr().out
 
 
 def test_a_result_says_what_it_was_made_of(finished: Path):
@@ -361,6 +379,8 @@ def test_seconds_become_as_many_steps_as_fit(finished: Path, tmp_path: Path, mon
         ("design", {"scale": 0.0}, "--scale is 0"),
         ("design", {"seeds": 0}, "--seeds is 0"),
         ("design", {"threads": 10**6}, "--threads is 1000000"),
+        ("design", {"against": Path("no.json")}, "--against no.json cannot be read (No such file or directory)"),
+        ("design", {"against": Path(__file__)}, f"--against {__file__} holds no results of enerf bench"),
         ("spiral", {"reconstruction_weights": Path("no.pth")}, "--reconstruction-weights no.pth does not exist"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -48,6 +49,25 @@ def test_rays_are_those_of_nerfstudios_cameras_at_the_same_poses():
     torch.testing.assert_close(rays.metadata["directions_norm"], expected.metadata["directions_norm"])
     assert rays.pixel_area.shape == (50, 1) and rays.pixel_area[0].item() == pytest.approx(1 / (20 * 22))
     assert rays.camera_indices is None
+
+
+@pytest.mark.parametrize(("camera", "tolerance"), [(CAMERA, 1e-6), (DISTORTED, 1e-3)])
+def test_rays_go_through_places_in_their_pixels(camera: Camera, tolerance: float):
+    """As OpenCV undistorts them; with distortion, steps from pixel to pixel are differences."""
+    pixels, times = draw()
+    places = torch.rand(50, 2, generator=torch.Generator().manual_seed(2)) - 0.5
+    posed = PosedCamera(camera, trajectory(), TRANSFORM, SCALE)
+    rays = posed.rays(pixels, times, places=places)
+    points = torch.stack([pixels % 24, pixels // 24], dim=-1).double() + places
+    seen = cv2.undistortPoints(points.numpy()[:, None], camera.matrix, np.array(camera.distortion or (0.0,) * 4))[:, 0]
+    towards = np.column_stack([seen, np.ones(50)])
+    rotations = TURN @ trajectory().poses(times).numpy()[:, :, :3]
+    expected = np.einsum("nij,nj->ni", rotations, towards)
+    norms = np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays.directions, expected / norms, atol=tolerance)
+    np.testing.assert_allclose(rays.metadata["directions_norm"], norms, atol=tolerance)
+    centres = posed.rays(pixels, times, places=torch.zeros(50, 2)).directions
+    torch.testing.assert_close(centres, posed.rays(pixels, times).directions)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
