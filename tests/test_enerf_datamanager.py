@@ -11,6 +11,7 @@ import torch
 from small_runs import HEIGHT, WIDTH, set_up, small_config
 
 from enerf_ns.dataparsers.files import load_image
+from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -150,6 +151,33 @@ def test_nothing_is_learnt_from_events_that_are_held_out(recording: Path, tmp_pa
     chosen = manager.held_out_pair_sampler.sample(5000, torch.Generator().manual_seed(0))
     ends = torch.cat([chosen.start, chosen.end])
     assert held_out(ends, 0.2).all() and held_out(times, 0.2).sum() > len(ends.unique()) > 50
+
+
+def test_no_instant_that_is_paired_lies_in_what_is_held_out(recording: Path, tmp_path: Path):
+    changes: dict[str, Any] = {
+        "data__instant_pairs": 5000,
+        "data__instants_apart_ms": 100.0,
+        "data__held_out_events": 0.2,
+    }
+    pipeline = set_up(small_config(recording, tmp_path, **changes)).pipeline
+    manager = pipeline.datamanager
+    events = manager.next_batch(pipeline.model.sensor).events
+    assert len(events) == 64 + 5000 and events.num_silent == 0 and events.ahead is not None
+    assert not events.ahead[:64].any() and events.ahead[64:].any(), "pairs of events are exact"
+    ends = torch.cat([events.start, events.end])
+    assert not held_out(ends, 0.2 - 4e-6).any() and len((ends * 8 // 10**8).unique()) == 8
+    assert (events.on + events.off == 0)[64:].any() and (events.on + events.off > 0)[64:].any()
+    index, chosen = manager.index, slice(64, None)
+    until = [index.count_until(events.pixels[chosen], times[chosen]) for times in (events.start, events.end)]
+    assert torch.equal(until[1] - until[0], (events.on + events.off)[chosen])
+
+
+def test_a_run_from_before_any_instants_were_paired_pairs_none():
+    config = EnerfDataManagerConfig()
+    state = {name: value for name, value in vars(config).items() if name not in ("instant_pairs", "instants_apart_ms")}
+    before = EnerfDataManagerConfig.__new__(EnerfDataManagerConfig)
+    before.__setstate__(state)
+    assert before.instant_pairs == 0 and before.silent_pairs == config.silent_pairs
 
 
 def test_without_held_out_events_the_correlation_is_that_of_training_pairs(recording: Path, tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +40,23 @@ def test_losses_of_training_have_gradients_and_those_of_evaluation_have_none(pip
 
 
 def test_the_scores_of_events_are_those_of_what_is_rendered(pipeline: Any):
-    """Over pairs that are held out, by a generator of its own, so that they are the same each time."""
+    """Over pairs that are held out, by a generator of its own, so that they are the same each time; a pixel sees the
+    mean over its area."""
     torch.nn.init.normal_(pipeline.model.field.geometry.grid.table)  # at first nothing changes
     found = pipeline.event_scores(300)
     assert pipeline.event_scores(300) == found and pipeline.model.sensor.response == Logarithm(0.001)
     pairs = pipeline.datamanager.held_out_pair_sampler.sample(300, torch.Generator().manual_seed(0))
     levels = []
     for times in (pairs.start, pairs.end):
-        rays = pipeline.datamanager.event_camera.rays(pairs.pixels, times)
-        pipeline.eval()
-        with torch.no_grad():
-            levels.append(torch.log(luma(pipeline.model(rays)["rgb"].double()) + 0.001))
-        pipeline.train()
+        seen = []
+        for x, y in product((-0.375, -0.125, 0.125, 0.375), repeat=2):
+            places = torch.tensor([[x, y]]).expand(300, 2)
+            rays = pipeline.datamanager.event_camera.rays(pairs.pixels, times, places=places)
+            pipeline.eval()
+            with torch.no_grad():
+                seen.append(luma(pipeline.model(rays)["rgb"].double()))
+            pipeline.train()
+        levels.append(torch.log(torch.stack(seen).mean(dim=0) + 0.001))
     c_on, c_off = pipeline.model.sensor.contrast_thresholds
     change, measured = (levels[1] - levels[0]).numpy(), (c_on * pairs.on - c_off * pairs.off).double().numpy()
     assert found["event_correlation"] == pytest.approx(np.corrcoef(change, measured)[0, 1], abs=1e-4)

@@ -93,7 +93,7 @@ def test_a_row_that_lost_against_another_version_is_an_error(finished: Path, tmp
     settings = BenchSettings(**{**SMALL_BENCH, "output_dir": finished, "against": tmp_path / "before.json"})
     command = BenchCommand("design", settings)
     if fails:
-        with pytest.raises(FlagError, match="lost more than 0.3 dB"):
+        with pytest.raises(FlagError, match=r"lost more than 0\.3 dB"):
             command.main()
     else:
         command.main()
