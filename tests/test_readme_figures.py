@@ -38,7 +38,8 @@ def test_every_table_of_a_readme_is_that_of_its_result_file(readme: Path):
 def test_every_result_file_is_shown_and_from_one_version_of_the_code():
     shown = [file for readme in READMES for _, file, _ in tables(readme.read_text())]
     committed = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
-    assert {str(file.relative_to(ROOT)) for file in committed} == set(shown)
+    gate = "benchmarks/validation.json"  # of the version that last changed a default, whenever the others were made
+    assert {str(file.relative_to(ROOT)) for file in committed} | {gate} == set(shown)
     versions = {run["version"] for file in committed for run in json.loads(file.read_text())["runs"]}
     assert len(versions) <= 1 and not any("dirty" in version for version in versions)
 
