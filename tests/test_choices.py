@@ -151,7 +151,7 @@ def test_any_instants_are_paired_where_events_alone_are_learnt_from_and_pixels_s
         return resolve(config, read_recording(recording))
 
     def pairs(**changes: Any) -> int:
-        return chosen(**changes).values.get("datamanager.instant_pairs", changes.get("data__instant_pairs"))
+        return chosen(**changes).values.get("datamanager.instant_pairs", changes.get("data__instant_pairs", -1))
 
     assert pairs() == 682 and pairs(data__event_pairs=100) == 100 and pairs(data__instant_pairs=7) == 7
     assert chosen(data__instant_pairs=0).values["datamanager.silent_pairs"] == 341

@@ -162,9 +162,9 @@ def _map_correlation(sensor: SensorModel, recording: Path) -> dict[str, float]:
 
 def _events(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     """How well held-out events are rendered, as far as that can be told, and the scale of the brightness fit."""
-    found = {name: score for name, score in run.pipeline.event_scores().items() if not isinstance(score, str)}
+    found = {name: float(score) for name, score in run.pipeline.event_scores().items() if not isinstance(score, str)}
     scale = aligned_views(views)[1].get("brightness_scale")
-    return found if scale is None else {**found, "brightness_scale": scale}
+    return found if scale is None else {**found, "brightness_scale": float(scale)}
 
 
 def milliseconds_a_step(run: Run) -> float:
