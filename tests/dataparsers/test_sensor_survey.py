@@ -53,10 +53,11 @@ def test_a_refractory_period_that_events_contradict_is_a_problem(recording: Even
 
 @pytest.mark.slow
 def test_slider_depth(shared_data: Path):
-    """A DAVIS240C: its frames disturb its events, and its bias generator makes thresholds of some tenths."""
+    """A DAVIS240C, whose frames disturb its events. Fields that learnt from them with thresholds of 0.54 and 0.35, as
+    least squares had them, have half of the contrast of held-out frames."""
     survey = SensorSurvey.of(read_recording(shared_data / "slider_depth"))
     (on, off), bursts = survey.contrast_thresholds, survey.bursts
     assert survey.is_mean_measured and survey.problems() == [] and survey.refractory_period is None
-    assert 0.4 < on.value < 0.7 and 0.25 < off.value < 0.5 and max(on.error, off.error) < 0.1
+    assert 0.7 < on.value < 1.0 and 0.5 < off.value < 0.8 and max(on.error, off.error) < 0.1
     assert bursts is not None and len(bursts.delays) == 2 and 0.08 < bursts.excess < 0.13
     assert bursts.delays[0, 0] < 0 < bursts.delays[1, 0] and bursts.ratio.max() > 10
