@@ -392,6 +392,8 @@ class _Resolver:
             why = "frames tell of what lies between edges"
         elif not self.config.defaults.instants:
             why = "the method does without"
+        elif not pairs:
+            why = "other pairs are set by flag"
         self.row("any instants", bool(pairs), value, self.why(name, why), name)
 
     def _longest_worth_summing(self) -> float:

@@ -68,8 +68,8 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     supervision: Literal["events", "events+frames", "frames"] = "events"
     """What the field learns from."""
     event_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of instants with events between them, drawn at each step. None: 1024, of noisy events beside frames 725, or
-    as the paper for enerf-paper."""
+    """Pairs of instants with events between them, drawn at each step. None: 1024, beside pairs of any instants 683,
+    of noisy events beside frames 256, or as the paper for enerf-paper."""
     pair_mode: Optional[Literal["successor", "partner", "window", "accumulated"]] = None  # noqa: UP045
     """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. Or no two events,
     but a window of any length whose events are summed, as in EventNeRF (accumulated). None: one of the next few, but
@@ -91,7 +91,7 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Draw every pair alike, or every active pixel alike."""
     silent_pairs: Optional[int] = None  # noqa: UP045
     """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, beside
-    frames 128, or as the paper for enerf-paper. 0: silent pixels are not searched."""
+    frames 128, beside pairs of any instants none, or as the paper for enerf-paper. 0: silent pixels are not searched."""
     silent_mode: Literal["pixels", "intervals"] = "pixels"
     """Where silent pairs lie: at any pixel while it is silent for silence-ms, or between any two successive events of a
     pixel, as in the total variation of Deblur e-NeRF."""
