@@ -91,7 +91,7 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     """Draw every pair alike, or every active pixel alike."""
     silent_pairs: Optional[int] = None  # noqa: UP045
     """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, beside
-    frames 128, beside pairs of any instants none, or as the paper for enerf-paper. 0: silent pixels are not searched."""
+    frames 128, beside pairs of any instants none, or as the paper for enerf-paper. 0: none are searched."""
     silent_mode: Literal["pixels", "intervals"] = "pixels"
     """Where silent pairs lie: at any pixel while it is silent for silence-ms, or between any two successive events of a
     pixel, as in the total variation of Deblur e-NeRF."""
