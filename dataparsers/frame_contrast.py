@@ -1,4 +1,5 @@
-"""Contrast thresholds from frames: what an event is worth in the log brightness of the frames of the same camera."""
+"""What frames of the same camera tell that events leave open: contrast thresholds, which an event is worth in log
+brightness, and the level of brightness."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from scipy import ndimage
 
 from enerf_ns.dataparsers.event_index import EventIndex
 from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.picture_depth import brightness
 from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording, Frames
 
 DARKEST, BRIGHTEST = 20, 245
@@ -35,6 +37,9 @@ FEWEST_NEIGHBOURS = 4
 GONE_ON = 0.35
 """Thresholds by which log brightness has gone on since the last event, in its direction, where it changes from frame to
 frame; of simulated recordings of ideal sensors, thresholds are then right within 3 %."""
+
+FAINTEST = 0.01
+"""Least brightness that counts in a mean of log brightness: what is darker is as dark, however black it is."""
 
 FEWEST_ROWS = 1000
 """Fewest changes of a pixel between frames that thresholds are fitted to."""
@@ -103,6 +108,33 @@ def thresholds_from_frames(
     if not (np.all((values > least) & (values < largest)) and np.all(errors < LARGEST_ERROR * values)):
         return None
     return values, errors, why
+
+
+def mean_brightness(recording: EventRecording, frames: Frames, event_share: float) -> float | None:
+    """Geometric mean of the brightness that frames show of what a field is asked for that learns from events.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        frames: Those that may be looked at; `NUM_STARTS` of them are, evenly taken.
+        event_share: Share of the rays that belong to events: pixels count in proportion to theirs. Of the others, all
+            pixels count alike.
+
+    Returns:
+        None where another camera took the frames.
+
+    Raises:
+        RecordingError: The file of a frame is missing or cannot be decoded.
+    """
+    if frames.camera != recording.camera or frames.trajectory is not recording.trajectory:
+        return None
+    chosen = np.unique(np.linspace(0, len(frames.times) - 1, NUM_STARTS).round().astype(int))
+    counts = index_events(recording).offsets.diff().numpy()
+    weights = event_share * counts / counts.sum() + (1.0 - event_share) / len(counts)
+    logs = []
+    for number in chosen.tolist():
+        image = brightness(frames.image(number)).reshape(len(counts), -1)
+        logs.append(np.log((image @ LUMA if image.shape[1] == 3 else image[:, 0]).clip(FAINTEST)) @ weights)
+    return float(np.exp(np.mean(logs)))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
+from enerf_ns.dataparsers.frame_contrast import mean_brightness
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
@@ -226,6 +227,7 @@ class _Resolver:
         self.preset_values: dict[str, Any] = {}
         self._blind_why = ""
         self._frames_tell_more = False
+        self._level_from = ""
         self._blind = 0
         if preset is not None:
             name, whole = preset_named(preset), config.defaults.whole_preset
@@ -558,7 +560,10 @@ class _Resolver:
         alone = self.use_events and not self.use_frames
         weight = self.use(name, lambda: self.config.defaults.level_loss_weight if alone else 0.0)
         why = "events leave the level of brightness open" if alone else "frames tell the level of brightness"
-        self.row("level of brightness", bool(weight), f"held near {MEAN_BRIGHTNESS:g}", self.why(name, why), name)
+        level = self.use("model.mean_brightness", self._mean_brightness if weight else lambda: MEAN_BRIGHTNESS)
+        why = self.why("model.mean_brightness", why)
+        value = f"held near {level:.3g}{self._level_from}"
+        self.row("level of brightness", bool(weight), value, self.why(name, why), name)
 
         name = "model.sensor.bayer_pattern"
         pattern = self.use(name, lambda: recording.bayer_pattern or GREY)
@@ -566,6 +571,19 @@ class _Resolver:
         self.use("model.sensor.height", lambda: recording.camera.height)
         if pattern != GREY:
             _check("--pipeline.model.bayer-pattern", lambda: ColourFilter(pattern, recording.camera.width))
+
+    def _mean_brightness(self) -> float:
+        """What the frames that are not held out show; `MEAN_BRIGHTNESS` where they tell nothing of it."""
+        if not self.recording.has_frames or self.recording.reconstructed_by:
+            return MEAN_BRIGHTNESS
+        frames, _ = split_frames(self.recording, self.parser, held_out=False)
+        data = Resolution(self.values).applied_to(self.config).datamanager
+        pairs = data.event_pairs + (data.instant_pairs or 0) + (data.silent_pairs or 0)
+        found = mean_brightness(self.recording, frames, data.event_pairs / pairs)
+        if found is None:
+            return MEAN_BRIGHTNESS
+        self._level_from = ", the geometric mean of the frames"
+        return found
 
     def _dynamic_range(self) -> None:
         """Whether brightness has an upper limit."""

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from tyro.conf import Fixed
 
+from enerf_ns.dataparsers.frame_contrast import FAINTEST
 from enerf_ns.density_voxels import DensityVoxels
 from enerf_ns.encodings.hash_grid import backend_of
 from enerf_ns.enerf_field import EnerfField, HashDensity
@@ -32,7 +33,7 @@ from enerf_ns.memory import in_parts
 from enerf_ns.ray_samplers import PairedPiecewiseSampler, PairedProposalSampler, PairedUniformSampler, paired_rand
 from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.sensor.sensor_model import SensorModelConfig
-from enerf_ns.supervision.balance import FrameBalance
+from enerf_ns.supervision.balance import ErrorBalance
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
 from enerf_ns.supervision.losses import distortion_loss, frame_loss
 
@@ -47,14 +48,11 @@ FAR_SHARE = 0.75
 """Share of a ray's light that comes from nearer than its far depth."""
 
 MEAN_BRIGHTNESS = 0.3
-"""Geometric mean of brightness near which a field is held that learns from events alone: both what is three times as
-bright and what is a third as bright lie where the field and linlog are logarithmic."""
+"""Geometric mean of brightness near which a field is held where neither frames nor a flag tell it: both what is three
+times as bright and what is a third as bright lie where the field and linlog are logarithmic."""
 
 FRAME_LOSS_WEIGHT = 10.0
 """Weight of the frame loss beside the regularisers."""
-
-FAINTEST = 1e-4
-"""Least brightness that counts in a mean of log brightness."""
 
 FARTHEST = 1000.0
 """Where rays end that go on beyond the box, in scene units: halves of its longest side."""
@@ -109,10 +107,13 @@ class EnerfModelConfig(ModelConfig):
     """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation. None:
     0, or as the paper for enerf-paper."""
     frame_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`FrameBalance`)."""
+    """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`ErrorBalance`)."""
     level_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the squared difference between the mean log brightness of a batch and that of `MEAN_BRIGHTNESS`. None:
+    """Weight of the squared difference between the mean log brightness of a batch and that of mean-brightness. None:
     0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
+    mean_brightness: Optional[float] = None  # noqa: UP045
+    """Geometric mean of brightness, of what is 1 in a frame that is white, near which a field is held that learns from
+    events alone. None: that of frames of the same camera, or `MEAN_BRIGHTNESS` where there are none."""
     opacity_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the share of each ray that no surface stops; 0 for an object before nothing. None: 0 where the sensor's
     border is silent, else 1."""
@@ -200,10 +201,11 @@ class EnerfModel(Model):
             and config.view_direction is not None
             and config.opacity_loss_weight is not None
         )
-        assert config.level_loss_weight is not None
+        assert config.level_loss_weight is not None and config.mean_brightness is not None
         assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
         self.sensor = config.sensor.setup()
-        self.frame_balance = FrameBalance() if config.frame_loss_weight is None else None
+        self.frame_balance = ErrorBalance() if config.frame_loss_weight is None else None
+        self.instant_balance = ErrorBalance()
         self.supervision = EventSupervision(
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
@@ -399,20 +401,29 @@ class EnerfModel(Model):
         config = self.config
         start, end, frames = batch.split(outputs["rgb"])
         losses: dict[str, Tensor] = {}
+        of_events: Tensor | None = None
+        event_share: Tensor | float = 1.0
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
+            if "event_loss" in losses:
+                of_events = losses["event_loss"].detach() / config.event_loss_weight
+            if of_events is not None and "instant_loss" in losses:
+                of_instants = losses["instant_loss"].detach() / config.event_loss_weight
+                weight = self.instant_balance(of_events, batch.events.num_pairs, of_instants, batch.events.num_any)
+                event_share = 1.0 / (1.0 + weight)
+                losses["event_loss"] = event_share * losses["event_loss"]
+                losses["instant_loss"] = (1.0 - event_share) * losses["instant_loss"]
             if self.training and self.sensor.threshold_map is not None:
                 self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
             if self.training and config.level_loss_weight:
                 seen = self.sensor.brightness(torch.cat([start, end]), batch.events.pixels.repeat(2))
-                level = (seen.clamp(min=FAINTEST) / MEAN_BRIGHTNESS).log().mean()
+                level = (seen.clamp(min=FAINTEST) / config.mean_brightness).log().mean()
                 losses["level_loss"] = config.level_loss_weight * level.square()
         if batch.frames is not None:
             error = self._frame_loss(frames, batch.frames)
             weight = config.frame_loss_weight
-            if self.frame_balance and batch.events is not None and "event_loss" in losses:
-                of_events = losses["event_loss"].detach() / config.event_loss_weight
-                weight = self.frame_balance(of_events, batch.num_pairs - batch.events.num_silent, error, len(frames))
+            if self.frame_balance and batch.events is not None and of_events is not None:
+                weight = event_share * self.frame_balance(of_events, batch.events.num_pairs, error, len(frames))
             losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
@@ -478,7 +489,9 @@ class EnerfModel(Model):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
         """Always strict: parameters that do not fit are an error, never a silently random field.
 
-        Checkpoints of earlier versions spell colour_network another way.
+        Checkpoints of earlier versions spell colour_network another way, and have no errors of pairs of any instants.
         """
-        state_dict = {name.replace("color_network", "colour_network"): value for name, value in state_dict.items()}
+        state_dict = self.instant_balance.state_dict(prefix="instant_balance.") | {
+            name.replace("color_network", "colour_network"): value for name, value in state_dict.items()
+        }
         return super().load_state_dict(state_dict, strict=True, assign=assign)

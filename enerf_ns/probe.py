@@ -30,7 +30,7 @@ SCORED_BATCHES = 16
 """Batches of held-out pixels by which they are compared."""
 
 
-MEASURED = ("event_loss", "frame_loss")
+MEASURED = ("event_loss", "instant_loss", "frame_loss")
 """Losses that compare the field with what was recorded."""
 
 

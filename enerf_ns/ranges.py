@@ -107,6 +107,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "no_event_margin": (0.0, 1.0),
     "frame_loss_weight": WEIGHT,
     "level_loss_weight": WEIGHT,
+    "mean_brightness": (1e-3, 1e3),
     "opacity_loss_weight": WEIGHT,
     "distortion_loss_weight": WEIGHT,
     "interlevel_loss_weight": WEIGHT,

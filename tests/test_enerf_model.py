@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from enerf_ns.enerf_model import MEAN_BRIGHTNESS
 from enerf_ns.evaluation.views import held_out_views
 from enerf_ns.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
-from enerf_ns.supervision.balance import FrameBalance
+from enerf_ns.supervision.balance import ErrorBalance
 from enerf_ns.supervision.losses import distortion_loss
 
 
@@ -30,6 +31,7 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
         model__frame_loss_weight=3.0,
         model__opacity_loss_weight=0.5,
         model__level_loss_weight=0.2,
+        model__mean_brightness=MEAN_BRIGHTNESS,
     )
     return set_up(config).pipeline
 
@@ -142,12 +144,36 @@ def test_frames_beside_events_are_weighed_by_the_errors_of_both(pipeline: Any):
     model = pipeline.model
     outputs = model(rays)
     before = model.get_loss_dict(outputs, batch)
-    model.frame_balance = FrameBalance()
+    model.frame_balance = ErrorBalance()
     after = model.get_loss_dict(outputs, batch)
     model.frame_balance = None
     pairs, pixels = len(batch.events) - batch.events.num_silent, len(batch.frames.indices)
     torch.testing.assert_close(after["frame_loss"], before["event_loss"] / pairs * pixels)
     assert all(torch.equal(after[name], before[name]) for name in before if name != "frame_loss")
+
+
+@pytest.mark.parametrize("frames_are_weighed", [False, True])
+def test_pairs_of_any_instants_are_weighed_by_the_errors_of_both(pipeline: Any, frames_are_weighed: bool):
+    """Each kind as its number over its mean error; both together as one loss of weight 1."""
+    batch, rays = rays_of(pipeline)
+    model = pipeline.model
+    outputs = model(rays)
+    events = batch.events
+    number = events.num_pairs // 3
+    some = replace(batch, events=replace(events, num_any=number))
+    start, end, _ = batch.split(outputs["rgb"])
+    means = model.supervision.losses(start, end, some.events, model.sensor)
+    model.instant_balance = ErrorBalance()
+    model.frame_balance = ErrorBalance() if frames_are_weighed else None
+    losses = model.get_loss_dict(outputs, some)
+    model.instant_balance, model.frame_balance = ErrorBalance(), None
+    numbers = {"event_loss": events.num_pairs - number, "instant_loss": number}
+    shares = {name: numbers[name] / float(means[name]) for name in numbers}
+    for name in numbers:
+        torch.testing.assert_close(losses[name], shares[name] / sum(shares.values()) * means[name])
+    if frames_are_weighed:
+        of_frame = len(batch.frames.indices) / numbers["event_loss"]
+        torch.testing.assert_close(losses["frame_loss"], of_frame * losses["event_loss"])
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

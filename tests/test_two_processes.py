@@ -11,7 +11,7 @@ import torch.distributed
 from small_runs import set_up, small_config
 from torch.multiprocessing.spawn import spawn
 
-from enerf_ns.supervision.balance import FrameBalance
+from enerf_ns.supervision.balance import ErrorBalance
 
 STEPS = 4
 
@@ -80,7 +80,7 @@ def test_two_processes_train_as_one_would_with_both_batches(recording: Path, tmp
 def weigh_one_of_two(rank: int, folder: Path) -> None:
     """What one process does; the weight that it finds and what it remembers are stored."""
     torch.distributed.init_process_group("gloo", f"file://{folder / 'meet'}", rank=rank, world_size=2)
-    balance = FrameBalance()
+    balance = ErrorBalance()
     weight = balance(torch.tensor(1.0 + 2.0 * rank), 100, torch.tensor(0.1 + 0.3 * rank), 50)
     if rank == 0:  # which alone evaluates, and must not wait for the other
         assert balance.eval()(torch.tensor(9.0), 1, torch.tensor(9.0), 1) == 2.0 / 0.25

@@ -25,6 +25,8 @@ class EventBatch:
     """Number of negative events of each pair, after the first instant and up to and with the second."""
     num_silent: int = 0
     """Number of pairs of silent pixels, whose instants are any between two of their events; they come last."""
+    num_any: int = 0
+    """Number of pairs of any two instants, whatever the pixel fired between them; they come before silent ones."""
     starts_at_events: bool = True
     """Whether the pairs of events begin at events, after which pixels may be blind; windows of time do not."""
     rates: Float[Tensor, "pairs 2 2"] | None = None
@@ -47,8 +49,23 @@ class EventBatch:
 
     @property
     def fired(self) -> slice:
-        """Which pairs are of events."""
+        """Which pairs are of events, or of any instants."""
         return slice(len(self) - self.num_silent)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs of events."""
+        return len(self) - self.num_silent - self.num_any
+
+    @property
+    def of_events(self) -> slice:
+        """Which pairs are of events."""
+        return slice(self.num_pairs)
+
+    @property
+    def of_any(self) -> slice:
+        """Which pairs are of any instants."""
+        return slice(self.of_events.stop, self.fired.stop)
 
     @property
     def silent(self) -> slice:
@@ -70,6 +87,7 @@ class EventBatch:
         return EventBatch(
             *joined,
             num_silent=others.num_silent,
+            num_any=self.num_any + others.num_any,
             starts_at_events=self.starts_at_events,
             rates=rates,
             ahead=ahead,
@@ -78,13 +96,14 @@ class EventBatch:
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
         """The pairs that are chosen."""
         columns = (column[chosen] for column in self.columns)
-        num_silent = int(chosen[self.silent].sum())
+        num_silent, num_any = int(chosen[self.silent].sum()), int(chosen[self.of_any].sum())
         rates, ahead, slopes = (
             None if column is None else column[chosen] for column in (self.rates, self.ahead, self.slopes)
         )
         return EventBatch(
             *columns,
             num_silent=num_silent,
+            num_any=num_any,
             starts_at_events=self.starts_at_events,
             rates=rates,
             ahead=ahead,

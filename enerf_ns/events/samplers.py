@@ -406,7 +406,8 @@ class InstantPairSampler:
         on = _positives(self.index, until[1]) - _positives(self.index, until[0])
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
-        return EventBatch(pixels, start, end, on, until[1] - until[0] - on, starts_at_events=False, ahead=ahead)
+        off = until[1] - until[0] - on
+        return EventBatch(pixels, start, end, on, off, num_any=batch_size, starts_at_events=False, ahead=ahead)
 
     def _is_on(self, until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
         """Whether the last of so many first events of the index, of a pixel that has one, is an on event."""

@@ -51,7 +51,8 @@ class EventSupervision:
         batch: EventBatch,
         sensor: SensorModel,
     ) -> dict[str, Tensor]:
-        """event_loss, where the batch has events, and no_event_loss, where it has silent pixels; with their weights.
+        """event_loss, where the batch has pairs of events, instant_loss, where it has pairs of any instants, and
+        no_event_loss, where it has silent pixels; with their weights.
 
         Args:
             start: Brightness rendered at the first instants.
@@ -60,12 +61,13 @@ class EventSupervision:
             sensor: What measured it.
         """
         change = brightness_change(start, end, batch, sensor)
-        fired, silent = batch.fired, batch.silent
+        silent = batch.silent
         losses: dict[str, Tensor] = {}
         measured = sensor.measured_change(batch)
-        if batch.num_silent < len(batch):
-            loss = EVENT_LOSSES[self.event_loss](change[fired], measured[fired], sensor.mean_threshold)
-            losses["event_loss"] = self.event_loss_weight * loss
+        for name, pairs in (("event_loss", batch.of_events), ("instant_loss", batch.of_any)):
+            if pairs.stop > (pairs.start or 0):
+                loss = EVENT_LOSSES[self.event_loss](change[pairs], measured[pairs], sensor.mean_threshold)
+                losses[name] = self.event_loss_weight * loss
         if batch.num_silent:
             silence = change[silent] - measured[silent] if sensor.leaks else change[silent]
             loss = no_event_loss(silence, sensor.contrast_thresholds, self.no_event_margin)

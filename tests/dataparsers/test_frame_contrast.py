@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from waves import CAMERA, events_of_waves, recording_of
 
-from enerf_ns.dataparsers.frame_contrast import thresholds_from_frames
+from enerf_ns.dataparsers.frame_contrast import mean_brightness, thresholds_from_frames
 from enerf_ns.dataparsers.recording import EventRecording, Events
 
 FRAMES = np.arange(1, 40) * 25_000_000
@@ -93,3 +93,29 @@ def test_noise_of_the_events_does_not_make_them_worth_less(tmp_path: Path):
     found = thresholds_from_frames(noisy, 0)
     assert found is not None
     np.testing.assert_allclose(found[0], (0.28, 0.2), rtol=0.15)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_level_of_brightness_is_a_mean_over_pixels_and_their_events(recording: EventRecording, share: float):
+    frames = recording.frames
+    assert frames is not None
+    events = events_of_waves((0.28, 0.2), 1.0)
+    counts = np.bincount(events.y * CAMERA.width + events.x, minlength=CAMERA.width * CAMERA.height)
+    logs = [np.log(np.maximum(frames.image(i)[..., 0].ravel() / 255, 0.01)) for i in range(len(frames.times))]
+    expected = np.exp((1 - share) * np.mean(logs) + share * np.average(np.mean(logs, axis=0), weights=counts))
+    assert mean_brightness(recording, frames, share) == pytest.approx(expected, rel=0.02)
+
+
+def test_what_is_black_counts_as_nearly_black_in_the_level(recording: EventRecording, tmp_path: Path):
+    frames = recording.frames
+    assert frames is not None
+    Image.fromarray(np.zeros((CAMERA.height, CAMERA.width), np.uint8)).save(tmp_path / "black.png")
+    black = replace(frames, filenames=(tmp_path / "black.png",) * len(frames.times))
+    assert mean_brightness(recording, black, 0.0) == pytest.approx(0.01)
+
+
+def test_frames_of_another_camera_do_not_tell_the_level(recording: EventRecording):
+    frames = recording.frames
+    assert frames is not None
+    other = replace(frames, camera=replace(frames.camera, fx=frames.camera.fx + 1.0))
+    assert mean_brightness(recording, other, 0.5) is None

@@ -21,6 +21,17 @@ def test_silent_pairs_come_last():
     assert joined.pixels[joined.fired].tolist() == [0, 1, 2] and joined.pixels[joined.silent].tolist() == [100, 101]
 
 
+def test_pairs_of_any_instants_come_between_those_of_events_and_silent_ones():
+    some = replace(events(2, 100, False), num_any=2)
+    joined = events(3, 0, False).followed_by(some).followed_by(events(2, 200, True))
+    parts = (joined.of_events, joined.of_any, joined.silent)
+    assert [joined.pixels[part].tolist() for part in parts] == [[0, 1, 2], [100, 101], [200, 201]]
+    assert joined.num_pairs == 3 and joined.pixels[joined.fired].tolist() == [0, 1, 2, 100, 101]
+    subset = joined.subset(torch.tensor([True, False, True, False, True, False, True]))
+    parts = (subset.of_events, subset.of_any, subset.silent)
+    assert [subset.pixels[part].tolist() for part in parts] == [[0, 2], [101], [201]]
+
+
 def test_a_subset_knows_which_of_its_pairs_are_silent():
     joined = events(3, 0, False).followed_by(events(2, 100, True))
     subset = joined.subset(torch.tensor([True, False, True, False, True]))

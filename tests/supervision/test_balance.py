@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.optimize import minimize_scalar
 
-from enerf_ns.supervision.balance import FrameBalance
+from enerf_ns.supervision.balance import ErrorBalance
 
 
 @pytest.mark.parametrize(("noise_of_events", "noise_of_frames"), [(1.0, 0.01), (0.3, 0.3), (0.05, 0.5)])
@@ -22,7 +22,7 @@ def test_what_is_fitted_is_the_most_likely_where_nobody_knows_the_noise(noise_of
 
     expected = minimize_scalar(unlikelihood, bounds=(0.5, 1.7), method="bounded").x
 
-    value, balance = torch.tensor(1.1, dtype=torch.float64, requires_grad=True), FrameBalance()
+    value, balance = torch.tensor(1.1, dtype=torch.float64, requires_grad=True), ErrorBalance()
     for _ in range(3000):
         of_events, of_frames = ((measured - value).square().mean() for measured in (events, frames))
         weight = balance(of_events, len(events), of_frames, len(frames))
@@ -33,12 +33,12 @@ def test_what_is_fitted_is_the_most_likely_where_nobody_knows_the_noise(noise_of
 
 
 def test_the_first_step_has_the_weight_of_its_own_errors():
-    weight = FrameBalance()(torch.tensor(2.0), 1000, torch.tensor(0.05), 100)
+    weight = ErrorBalance()(torch.tensor(2.0), 1000, torch.tensor(0.05), 100)
     assert float(weight) == pytest.approx(100 / 1000 * 2.0 / 0.05)
 
 
 def test_steps_that_are_not_finite_are_not_remembered():
-    balance = FrameBalance()
+    balance = ErrorBalance()
     balance(torch.tensor(2.0), 10, torch.tensor(0.5), 10)
     before = balance.errors.clone()
     balance(torch.tensor(2.0), 10, torch.tensor(float("nan")), 10)
@@ -47,7 +47,7 @@ def test_steps_that_are_not_finite_are_not_remembered():
 
 
 def test_evaluation_looks_and_does_not_remember():
-    balance = FrameBalance()
+    balance = ErrorBalance()
     balance(torch.tensor(2.0), 10, torch.tensor(0.5), 10)
     before = balance.errors.clone()
     balance.eval()
@@ -57,5 +57,5 @@ def test_evaluation_looks_and_does_not_remember():
 
 def test_the_weight_has_no_gradient_and_is_finite_where_frames_are_met_exactly():
     error = torch.tensor(0.0, requires_grad=True)
-    weight = FrameBalance()(torch.tensor(1.0, requires_grad=True), 1, error, 1)
+    weight = ErrorBalance()(torch.tensor(1.0, requires_grad=True), 1, error, 1)
     assert not weight.requires_grad and bool(weight.isfinite())

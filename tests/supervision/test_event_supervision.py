@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,3 +107,16 @@ def test_a_perfect_render_costs_nothing():
     for name in EVENT_LOSSES:
         loss = EventSupervision(name, 1.0, 1.0, 0.0).losses(start, end, pairs, sensed)["event_loss"]
         assert loss.item() == pytest.approx(0.0, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["huber", "squared", "normalised"])
+def test_pairs_of_any_instants_have_a_loss_of_their_own_that_is_formed_alike(name: str):
+    pairs = replace(batch(SOME), num_any=5)
+    supervision = EventSupervision(name, 2.0, 0.5, 0.5)
+    losses = supervision.losses(START, END, pairs, sensor())
+    for part, loss in ((pairs.of_events, "event_loss"), (pairs.of_any, "instant_loss")):
+        alone = pairs.subset(torch.isin(torch.arange(12), torch.arange(12)[part]))
+        alone = replace(alone, num_any=0)
+        expected = supervision.losses(START[part], END[part], alone, sensor())["event_loss"]
+        torch.testing.assert_close(losses[loss], expected)
+    assert losses["no_event_loss"] > 0 and len(losses) == 3
