@@ -3,6 +3,7 @@ brightness, and the level of brightness."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +40,7 @@ GONE_ON = 0.35
 frame; of simulated recordings of ideal sensors, thresholds are then right within 3 %."""
 
 FAINTEST = 0.01
-"""Least brightness that counts in a mean of log brightness: what is darker is as dark, however black it is."""
+"""Brightness up to which nothing counts in a mean of log brightness: how black what is black is, nobody knows."""
 
 FEWEST_ROWS = 1000
 """Fewest changes of a pixel between frames that thresholds are fitted to."""
@@ -113,6 +114,8 @@ def thresholds_from_frames(
 def mean_brightness(recording: EventRecording, frames: Frames, event_share: float) -> float | None:
     """Geometric mean of the brightness that frames show of what a field is asked for that learns from events.
 
+    What is not brighter than `FAINTEST` does not count.
+
     Args:
         recording: Its index is made if it is not there yet.
         frames: Those that may be looked at; `NUM_STARTS` of them are, evenly taken.
@@ -120,7 +123,7 @@ def mean_brightness(recording: EventRecording, frames: Frames, event_share: floa
             pixels count alike.
 
     Returns:
-        None where another camera took the frames.
+        None where another camera took the frames, or they are black.
 
     Raises:
         RecordingError: The file of a frame is missing or cannot be decoded.
@@ -130,11 +133,14 @@ def mean_brightness(recording: EventRecording, frames: Frames, event_share: floa
     chosen = np.unique(np.linspace(0, len(frames.times) - 1, NUM_STARTS).round().astype(int))
     counts = index_events(recording).offsets.diff().numpy()
     weights = event_share * counts / counts.sum() + (1.0 - event_share) / len(counts)
-    logs = []
+    total, weight = 0.0, 0.0
     for number in chosen.tolist():
         image = brightness(frames.image(number)).reshape(len(counts), -1)
-        logs.append(np.log((image @ LUMA if image.shape[1] == 3 else image[:, 0]).clip(FAINTEST)) @ weights)
-    return float(np.exp(np.mean(logs)))
+        level = image @ LUMA if image.shape[1] == 3 else image[:, 0].astype(float)
+        is_seen = level > FAINTEST
+        total += np.log(level[is_seen]) @ weights[is_seen]
+        weight += weights[is_seen].sum()
+    return math.exp(total / weight) if weight else None
 
 
 @dataclass(frozen=True)

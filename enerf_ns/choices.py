@@ -77,6 +77,10 @@ class MethodDefaults:
     model.sampling, and values."""
 
 
+USUAL_RESPONSE = "logarithm:0.01"
+"""Response of a sensor that states none, where events alone are learnt from. With linlog, which is linear up to 8 % of
+full brightness, slider_depth comes out 1.2 dB worse, and its contrast 1.36 times too small in place of 1.06 times."""
+
 DEFAULT_SILENCE_MS = 20.0
 DEFAULT_WINDOW_MS = 60.0
 
@@ -448,6 +452,11 @@ class _Resolver:
     def _noise(self) -> Estimate:
         return noise_per_event(index_events(self.recording), self._balanced_thresholds)
 
+    @cached_property
+    def _border_rate(self) -> float:
+        """How often pixels at the sensor's border fired, where the others did once."""
+        return border_rate(index_events(self.recording), self.recording.camera.height)
+
     @property
     def _balanced_thresholds(self) -> tuple[float, float]:
         """Thresholds with a mean of 1 under which all events together cancel."""
@@ -544,11 +553,17 @@ class _Resolver:
             )
 
         name = "model.sensor.response"
-        stated = recording.response if self.use_frames else None
-        response = self.use(name, lambda: stated or "linlog")
+        usual, why, stated = "linlog", "the response of E-NeRF", recording.response if self.use_frames else None
+        if learns and not self.use_frames and self._border_rate < SILENT_BORDER:
+            # worth 1.1 dB on statue beside the response that it states
+            why = "it says how dark what is around an object is at most"
+        elif learns and not self.use_frames:
+            usual, why, stated = USUAL_RESPONSE, "pixels see the logarithm of brightness", recording.response
+        response = self.use(name, lambda: stated or usual)
         _check("--pipeline.model.response", lambda: response_named(response))
-        why = "the recording states it" if stated else "the response of E-NeRF"
-        if recording.response and not self.use_frames:
+        if stated:
+            why = "the recording states it"
+        elif recording.response:
             why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
         unknown = index is not None and self.config.model.sensor.response is None and not stated
         learned = self.use("model.sensor.learn_response", lambda: unknown and tells and self.use_frames)
@@ -750,7 +765,7 @@ class _Resolver:
         name = "model.opacity_loss_weight"
         why, before_nothing = "learns from frames alone", False
         if self.use_events:
-            share = border_rate(index_events(recording), recording.camera.height)
+            share = self._border_rate
             before_nothing = share < SILENT_BORDER
             what = "an object before nothing" if before_nothing else "rays meet surfaces there too"
             why = f"pixels at the sensor's border fired {share:.2g} times as often as the others: {what}"

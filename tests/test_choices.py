@@ -117,7 +117,7 @@ def test_without_flags_the_recording_decides_and_then_the_method(recording: Path
     values, simulated = resolution.values, read_recording(recording)
     assert values["model.sensor.contrast_thresholds"] == simulated.contrast_thresholds
     assert values["datamanager.dataparser.depth_range"] == simulated.depth_range
-    assert values["model.sensor.response"] == "linlog" and values["model.sensor.bayer_pattern"] == "grey"
+    assert values["model.sensor.response"] == simulated.response and values["model.sensor.bayer_pattern"] == "grey"
     assert values["datamanager.pair_mode"] == "partner" and values["model.num_channels"] == 1
     assert values["datamanager.event_pairs"] + values["datamanager.instant_pairs"] == 1024 + 341
     assert values["datamanager.instant_pairs"] == 682 and values["datamanager.silent_pairs"] == 0
@@ -231,6 +231,7 @@ def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recor
         row = rows(resolution)["response"]
         return resolution.values["model.sensor.learn_response"], f"{row.value}; {row.why}"
 
+    assert chosen("events", None, unknown)[1].startswith("logarithm:0.01; pixels see the logarithm of brightness")
     learned, said = chosen("events+frames", None, unknown)
     assert learned and "learned, starting from linlog" in said and "frames tell it better" in said
     for supervision, response, made in (
@@ -258,12 +259,12 @@ def test_frames_beside_events_have_the_weight_that_their_errors_make(recording: 
 
 
 def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_path: Path):
-    """The response where frames fix brightness: events alone are learnt from better with E-NeRF's."""
     stated = replace(
         read_recording(recording), response="logarithm:0.01", refractory_period=3_000_000, bayer_pattern="RGGB"
     )
     config = copy.deepcopy(ENERF)
-    assert resolve(config, stated).values["model.sensor.response"] == "linlog"
+    assert resolve(config, stated).values["model.sensor.response"] == "logarithm:0.01"
+    assert resolve(PAPER, stated).values["model.sensor.response"] == "linlog", "the paper's"
     config.datamanager.supervision = "events+frames"
     resolution = resolve(config, stated)
     sensor = resolution.applied_to(config).model.sensor.setup()

@@ -31,7 +31,7 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
         model__frame_loss_weight=3.0,
         model__opacity_loss_weight=0.5,
         model__level_loss_weight=0.2,
-        model__mean_brightness=MEAN_BRIGHTNESS,
+        model__mean_brightness=0.2,
     )
     return set_up(config).pipeline
 
@@ -66,6 +66,21 @@ def test_what_is_rendered_has_the_shapes_that_nerfstudio_asks_for(pipeline: Any)
     pipeline.train()
 
 
+@pytest.mark.parametrize("training", [False, True])
+def test_a_level_of_brightness_only_makes_pictures_brighter(recording: Path, tmp_path: Path, training: bool):
+    rendered = []
+    for number, level in enumerate((MEAN_BRIGHTNESS, 0.5 * MEAN_BRIGHTNESS)):
+        changes = {"model__level_loss_weight": 0.1, "model__mean_brightness": level}
+        pipeline: Any = set_up(small_config(recording, tmp_path / str(number), **changes)).pipeline
+        pipeline.train(training)
+        _, rays = rays_of(pipeline)
+        torch.manual_seed(0)
+        rendered.append(pipeline.model(rays))
+    torch.testing.assert_close(rendered[1]["rgb"], 0.5 * rendered[0]["rgb"])
+    torch.testing.assert_close(rendered[1]["accumulation"], rendered[0]["accumulation"])
+    assert rendered[0]["rgb"].abs().max() > 0.01
+
+
 def test_losses_are_those_of_the_parts(pipeline: Any):
     batch, rays = rays_of(pipeline)
     model = pipeline.model
@@ -79,8 +94,9 @@ def test_losses_are_those_of_the_parts(pipeline: Any):
     error = (luma(frames) - luma(batch.frames.colours)) ** 2
     torch.testing.assert_close(losses["frame_loss"], model.config.frame_loss_weight * error.mean())
     torch.testing.assert_close(losses["opacity_loss"], 0.5 * (1 - outputs["accumulation"]).mean())
-    level = torch.exp(torch.log(luma(torch.cat([start, end]))).mean())
-    torch.testing.assert_close(losses["level_loss"], 0.2 * torch.log(level / MEAN_BRIGHTNESS) ** 2)
+    seen = luma(torch.cat([start, end]))
+    level = torch.exp(torch.log(seen[seen > 0.01]).mean())
+    torch.testing.assert_close(losses["level_loss"], 0.2 * torch.log(level / model.config.mean_brightness) ** 2)
     psnr = model.get_metrics_dict(outputs, batch)["frame_psnr"]
     torch.testing.assert_close(psnr, -10 * torch.log10(error.mean()))
 

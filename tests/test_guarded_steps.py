@@ -103,7 +103,9 @@ def test_a_step_that_is_not_finite_changes_nothing(recording: Path, tmp_path: Pa
     assert f"Step 0 is left out, since {culprit}" in said and str(file) in said
     kept = torch.load(file, weights_only=True)
     assert kept["step"] == 0 and set(kept["losses"]) == {"event_loss", "distortion_loss", "interlevel_loss"}
-    assert kept["events"].pop("num_silent") == kept["events"].pop("num_any") == 0 and kept["events"].pop("starts_at_events")
+    assert kept["events"].pop("num_silent") == kept["events"].pop("num_any") == 0 and kept["events"].pop(
+        "starts_at_events"
+    )
     assert all(kept["events"].pop(name) is None for name in ("rates", "ahead", "slopes"))
     assert {len(column) for column in kept["events"].values()} == {64}
     assert math.isfinite(kept["losses"]["event_loss"]) == ("gradient" in name)

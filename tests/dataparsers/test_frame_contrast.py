@@ -106,12 +106,18 @@ def test_the_level_of_brightness_is_a_mean_over_pixels_and_their_events(recordin
     assert mean_brightness(recording, frames, share) == pytest.approx(expected, rel=0.02)
 
 
-def test_what_is_black_counts_as_nearly_black_in_the_level(recording: EventRecording, tmp_path: Path):
+def test_what_is_black_does_not_count_in_the_level(recording: EventRecording, tmp_path: Path):
     frames = recording.frames
     assert frames is not None
-    Image.fromarray(np.zeros((CAMERA.height, CAMERA.width), np.uint8)).save(tmp_path / "black.png")
-    black = replace(frames, filenames=(tmp_path / "black.png",) * len(frames.times))
-    assert mean_brightness(recording, black, 0.0) == pytest.approx(0.01)
+    half = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    half[:, : CAMERA.width // 2] = 102
+    for name, picture in (("black", np.zeros_like(half)), ("half", half)):
+        Image.fromarray(picture).save(tmp_path / f"{name}.png")
+    of_half, of_black = (
+        replace(frames, filenames=(tmp_path / f"{name}.png",) * len(frames.times)) for name in ("half", "black")
+    )
+    assert mean_brightness(recording, of_half, 0.5) == pytest.approx(0.4)
+    assert mean_brightness(recording, of_black, 0.5) is None
 
 
 def test_frames_of_another_camera_do_not_tell_the_level(recording: EventRecording):

@@ -79,6 +79,16 @@ def test_smooth_brightness_shows_none_and_a_blind_sensor_its_period():
     assert found is not None and abs(found.value - 8e6) < 3 * found.error < 3e6
 
 
+@pytest.mark.parametrize("threshold", [0.01, 0.02])
+def test_a_period_is_told_of_brightness_that_takes_as_long_again_to_turn_back(threshold: float):
+    """Turning back takes 1.3 and 1.6 times as long as going on, where it would take 12 and more without blindness."""
+    camera, thresholds = (WIDTH, HEIGHT), (threshold, threshold)
+    assert refractory_period(EventIndex.from_events(events_of_waves(thresholds, 3.0), *camera)) is None
+    found = refractory_period(EventIndex.from_events(events_of_waves(thresholds, 3.0, 8_000_000), *camera))
+    assert found is not None and found.value == pytest.approx(8e6, rel=0.1)
+    assert abs(found.value - 8e6) < found.error < 3e6
+
+
 def test_a_short_recording_tells_nothing():
     few = poisson(8e6, pixels=50)
     assert len(few) == 5000 and refractory_period(few) is None
