@@ -139,14 +139,15 @@ class EnerfModelConfig(ModelConfig):
     prompt: Fixed[Optional[str]] = None  # noqa: UP045
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before the sensor had a config of its own, before contraction, and before
-        fields started half opaque, too."""
+        """Reads config.yml of runs from before the sensor had a config of its own, before contraction, before fields
+        started half opaque, and before the level of brightness could be stated, too."""
         thresholds = state.pop("contrast_thresholds", None)
         if "sensor" not in state:
             state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
         if "hidden_dim_color" in state:
             state["hidden_dim_colour"] = state.pop("hidden_dim_color")
         before = {"contraction": False, "init_density": 0.01, "level_loss_weight": 0.0}
+        before["mean_brightness"] = MEAN_BRIGHTNESS
         self.__dict__.update({**before, **state})
 
 
