@@ -453,9 +453,21 @@ class _Resolver:
         return noise_per_event(index_events(self.recording), self._balanced_thresholds)
 
     @cached_property
-    def _border_rate(self) -> float:
-        """How often pixels at the sensor's border fired, where the others did once."""
-        return border_rate(index_events(self.recording), self.recording.camera.height)
+    def _seen_range(self) -> tuple[float, str]:
+        """The range of log brightness that a pixel sees by its events, once thresholds are chosen, and a reason."""
+        thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
+        index = index_events(self.recording)
+        learns = self.config.defaults.learns_sensor
+        if learns and self._blind:  # what pixels miss is seldom as much of either polarity
+            on, off = self._balanced_thresholds
+            thresholds = 0.5 * sum(thresholds) * on, 0.5 * sum(thresholds) * off
+        sums = span = log_brightness_range(index, thresholds)
+        why = f"events of a pixel span {sums:.2g} of log brightness"
+        if learns:
+            half = log_brightness_range(index, thresholds, parts=2)
+            span = max(2.0 * half - sums, 0.0)
+            why += f", {half:.2g} in half of the time: {span:.2g} without what drifts"
+        return span, f"{why}, {'more' if span > LOG_SIGMOID_RANGE else 'less'} than {LOG_SIGMOID_RANGE:g}"
 
     @property
     def _balanced_thresholds(self) -> tuple[float, float]:
@@ -554,16 +566,16 @@ class _Resolver:
 
         name = "model.sensor.response"
         usual, why, stated = "linlog", "the response of E-NeRF", recording.response if self.use_frames else None
-        if learns and not self.use_frames and self._border_rate < SILENT_BORDER:
+        if learns and not self.use_frames and self._seen_range[0] > LOG_SIGMOID_RANGE:
             # worth 1.1 dB on statue beside the response that it states
-            why = "it says how dark what is around an object is at most"
+            why = f"pixels see more than {LOG_SIGMOID_RANGE:g} of log brightness; linlog bounds what the darkest counts"
         elif learns and not self.use_frames:
             usual, why, stated = USUAL_RESPONSE, "pixels see the logarithm of brightness", recording.response
         response = self.use(name, lambda: stated or usual)
         _check("--pipeline.model.response", lambda: response_named(response))
         if stated:
             why = "the recording states it"
-        elif recording.response:
+        elif recording.response and not learns:
             why += f"; {recording.response}, which the recording states, matters where frames tell brightness"
         unknown = index is not None and self.config.model.sensor.response is None and not stated
         learned = self.use("model.sensor.learn_response", lambda: unknown and tells and self.use_frames)
@@ -602,22 +614,8 @@ class _Resolver:
 
     def _dynamic_range(self) -> None:
         """Whether brightness has an upper limit."""
-        name, why = "model.brightness", "no events are used"
-        span = 0.0
-        if self.use_events:
-            thresholds = self.config.model.sensor.contrast_thresholds or self.values["model.sensor.contrast_thresholds"]
-            index = index_events(self.recording)
-            learns = self.config.defaults.learns_sensor
-            if learns and self._blind:  # what pixels miss is seldom as much of either polarity
-                on, off = self._balanced_thresholds
-                thresholds = 0.5 * sum(thresholds) * on, 0.5 * sum(thresholds) * off
-            sums = span = log_brightness_range(index, thresholds)
-            why = f"events of a pixel span {sums:.2g} of log brightness"
-            if learns:
-                half = log_brightness_range(index, thresholds, parts=2)
-                span = max(2.0 * half - sums, 0.0)
-                why += f", {half:.2g} in half of the time: {span:.2g} without what drifts"
-            why += f", {'more' if span > LOG_SIGMOID_RANGE else 'less'} than {LOG_SIGMOID_RANGE:g}"
+        name = "model.brightness"
+        span, why = self._seen_range if self.use_events else (0.0, "no events are used")
         activation = self.use(name, lambda: "exponential" if span > LOG_SIGMOID_RANGE else "log-sigmoid")
         self.row("high dynamic range", activation == "exponential", activation, self.why(name, why), name)
 
@@ -765,7 +763,7 @@ class _Resolver:
         name = "model.opacity_loss_weight"
         why, before_nothing = "learns from frames alone", False
         if self.use_events:
-            share = self._border_rate
+            share = border_rate(index_events(recording), recording.camera.height)
             before_nothing = share < SILENT_BORDER
             what = "an object before nothing" if before_nothing else "rays meet surfaces there too"
             why = f"pixels at the sensor's border fired {share:.2g} times as often as the others: {what}"

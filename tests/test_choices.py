@@ -244,6 +244,15 @@ def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recor
         assert not learned and "learned" not in said
 
 
+def test_where_pixels_see_much_of_log_brightness_events_alone_are_learnt_from_with_linlog(recording: Path):
+    """Of pixels that go up by 24 events, and down again, twice."""
+    rises = np.repeat([1, -1, 1, -1], 24)[:, None] * np.broadcast_to(1, (96, WIDTH * HEIGHT))
+    unknown = of_unknown_sensor(recording, rises)
+    resolution = resolve(ENERF, unknown)
+    response, high = (rows(resolution)[part] for part in ("response", "high dynamic range"))
+    assert high.value == "exponential" and response.value == "linlog" and "log brightness" in response.why
+
+
 def test_frames_beside_events_have_the_weight_that_their_errors_make(recording: Path):
     for supervision, given, expected in (
         ("events", None, 10.0),

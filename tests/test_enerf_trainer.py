@@ -16,6 +16,7 @@ from small_runs import set_up, small_config
 
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.enerf_config import enerf
+from enerf_ns.enerf_model import MEAN_BRIGHTNESS
 from enerf_ns.sensor.response import Linlog
 from enerf_ns.tables import choices_table, recording_table
 
@@ -90,7 +91,7 @@ def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, t
     model = state.model.__dict__
     model["contrast_thresholds"] = model.pop("sensor").contrast_thresholds
     model["hidden_dim_color"] = model.pop("hidden_dim_colour") + 8
-    del model["contraction"], model["init_density"]
+    del model["contraction"], model["init_density"], model["mean_brightness"]
     del state.__dict__["defaults"], state.__dict__["resolution"]
     loaded = yaml.load(yaml.dump(state), Loader=yaml.Loader)
     assert loaded.model.sensor.contrast_thresholds == (0.3, 0.2)
@@ -100,6 +101,7 @@ def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, t
     assert pipeline.config.model.hidden_dim_colour == old.model.hidden_dim_colour + 8
     assert pipeline.config.model.max_res == old.model.max_res and pipeline.config.model.contraction is False
     assert pipeline.config.model.init_density == 0.01 == pipeline.model.field.geometry.init_density
+    assert pipeline.config.model.mean_brightness == MEAN_BRIGHTNESS
 
 
 def test_without_data_it_says_which_flag_is_missing(tmp_path: Path):
