@@ -232,7 +232,7 @@ class EnerfModel(Model):
             backend=config.hash_grid,
         )
         # a field has its own level, near which it starts: held elsewhere, slider_depth came out 1.3 dB worse
-        self._gain = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
+        self.gain = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
         # what has no upper end shines through anything
         self._faint = 0.0 if config.brightness == "exponential" else FAINT
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
@@ -300,8 +300,9 @@ class EnerfModel(Model):
         weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
         accumulation = self.renderer_accumulation(weights=weights)
         background = (1.0 - accumulation) * paired_rand(ray_bundle, 1)
+        rgb = torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + background
         return {
-            "rgb": self._gain * (torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + background),
+            "rgb": rgb if self.gain == 1.0 else self.gain * rgb,
             "accumulation": accumulation,
             "weights_list": [*weights_list, weights],
             "ray_samples_list": [*samples_list, samples],
@@ -332,7 +333,7 @@ class EnerfModel(Model):
             accumulation = self.renderer_accumulation(weights=weights)
             depth = self.renderer_depth(weights=weights, ray_samples=samples)
         return Outputs(
-            rgb=self._gain * rgb.expand(-1, 3),
+            rgb=self.gain * rgb.expand(-1, 3),
             accumulation=accumulation,
             depth=depth,
             normals=lambda: self.normals(rays.origins + rays.directions * depth),
@@ -405,18 +406,13 @@ class EnerfModel(Model):
         config = self.config
         start, end, frames = batch.split(outputs["rgb"])
         losses: dict[str, Tensor] = {}
-        of_events: Tensor | None = None
-        event_share: Tensor | float = 1.0
+        share: Tensor | float = 1.0  # of the pairs of events, beside those of any instants
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
-            if "event_loss" in losses:
-                of_events = losses["event_loss"].detach() / config.event_loss_weight
-            if of_events is not None and "instant_loss" in losses:
-                of_instants = losses["instant_loss"].detach() / config.event_loss_weight
-                weight = self.instant_balance(of_events, batch.events.num_pairs, of_instants, batch.events.num_any)
-                event_share = 1.0 / (1.0 + weight)
-                losses["event_loss"] = event_share * losses["event_loss"]
-                losses["instant_loss"] = (1.0 - event_share) * losses["instant_loss"]
+            if "event_loss" in losses and "instant_loss" in losses:
+                of_events, of_any, number = losses["event_loss"], losses["instant_loss"], batch.events.num_any
+                share = 1.0 / (1.0 + self.instant_balance(of_events, batch.events.num_pairs, of_any, number))
+                losses |= {"event_loss": share * of_events, "instant_loss": (1.0 - share) * of_any}
             if self.training and self.sensor.threshold_map is not None:
                 self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
             if self.training and config.level_loss_weight:
@@ -428,8 +424,9 @@ class EnerfModel(Model):
         if batch.frames is not None:
             error = self._frame_loss(frames, batch.frames)
             weight = config.frame_loss_weight
-            if self.frame_balance and batch.events is not None and of_events is not None:
-                weight = event_share * self.frame_balance(of_events, batch.events.num_pairs, error, len(frames))
+            if self.frame_balance and batch.events is not None and "event_loss" in losses:
+                of_events = losses["event_loss"].detach() / share / config.event_loss_weight
+                weight = share * self.frame_balance(of_events, batch.events.num_pairs, error, len(frames))
             losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]

@@ -118,7 +118,7 @@ def small_config(recording: EventRecording, supervision: Any = "events") -> Ener
     manager.supervision = supervision
     manager.event_pairs, manager.silent_pairs, manager.silence_ms = 256, 32, 5.0
     model.log2_table_size, model.num_levels = 12, 4
-    model.sampling, model.num_samples = "uniform", 8
+    model.sampling, model.num_samples, model.sensor.response = "uniform", 8, "linlog"  # by which the events were made
     return config
 
 
