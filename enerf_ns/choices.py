@@ -605,6 +605,7 @@ class _Resolver:
             return MEAN_BRIGHTNESS
         frames, _ = split_frames(self.recording, self.parser, held_out=False)
         data = Resolution(self.values).applied_to(self.config).datamanager
+        assert data.event_pairs is not None
         pairs = data.event_pairs + (data.instant_pairs or 0) + (data.silent_pairs or 0)
         found = mean_brightness(self.recording, frames, data.event_pairs / pairs)
         if found is None:

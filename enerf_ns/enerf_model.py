@@ -232,7 +232,7 @@ class EnerfModel(Model):
             backend=config.hash_grid,
         )
         # a field has its own level, near which it starts: held elsewhere, slider_depth came out 1.3 dB worse
-        self.gain = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
+        self.gain: float = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
         # what has no upper end shines through anything
         self._faint = 0.0 if config.brightness == "exponential" else FAINT
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
@@ -418,7 +418,7 @@ class EnerfModel(Model):
             if self.training and config.level_loss_weight:
                 seen = self.sensor.brightness(torch.cat([start, end]), batch.events.pixels.repeat(2))
                 is_seen = seen > FAINTEST
-                logs = (seen.clamp(min=FAINTEST) / config.mean_brightness).log()
+                logs = (seen.clamp(min=FAINTEST) / (MEAN_BRIGHTNESS * self.gain)).log()
                 level = (is_seen * logs).sum() / is_seen.count_nonzero().clamp(min=1)
                 losses["level_loss"] = config.level_loss_weight * level.square()
         if batch.frames is not None:

@@ -70,8 +70,10 @@ def test_what_is_rendered_has_the_shapes_that_nerfstudio_asks_for(pipeline: Any)
 def test_a_level_of_brightness_only_makes_pictures_brighter(recording: Path, tmp_path: Path, training: bool):
     rendered = []
     for number, level in enumerate((MEAN_BRIGHTNESS, 0.5 * MEAN_BRIGHTNESS)):
-        changes = {"model__level_loss_weight": 0.1, "model__mean_brightness": level}
-        pipeline: Any = set_up(small_config(recording, tmp_path / str(number), **changes)).pipeline
+        config = small_config(
+            recording, tmp_path / str(number), model__level_loss_weight=0.1, model__mean_brightness=level
+        )
+        pipeline: Any = set_up(config).pipeline
         pipeline.train(training)
         _, rays = rays_of(pipeline)
         torch.manual_seed(0)
