@@ -128,7 +128,7 @@ def share_closer(index: EventIndex, time: int) -> float:
     return float((np.diff(times)[follows] < time).mean()) if follows.any() else 0.0
 
 
-def contrast_thresholds(recording: EventRecording, blind: bool) -> tuple[Estimate, Estimate, bool]:
+def contrast_thresholds(recording: EventRecording, blind_for: int) -> tuple[Estimate, Estimate, bool]:
     """C_on and C_off, and whether their mean was measured.
 
     From frames of the camera of the events, where there are some (`thresholds_from_frames`). Else their mean is
@@ -139,24 +139,20 @@ def contrast_thresholds(recording: EventRecording, blind: bool) -> tuple[Estimat
 
     Args:
         recording: Its index is made if it is not there yet.
-        blind: Whether the sensor has a refractory period.
+        blind_for: The refractory period, ns; 0 for none.
 
     Raises:
         RecordingError: The events or a frame cannot be used.
     """
     index = index_events(recording)
-    blind_for = 0
-    if blind:
-        period = refractory_period(index)
-        blind_for = recording.refractory_period or (round(period.value) if period else 0)
     measured = thresholds_from_frames(recording, blind_for)
     if measured is not None:
         values, errors, why = measured
         on, off = (Estimate(float(value), float(error), why) for value, error in zip(values, errors, strict=True))
         return on, off, True
     num_on, num_off = index.num_positive, len(index) - index.num_positive
-    if blind or not num_on or not num_off:
-        why = "the sensor misses changes while it is blind" if blind else "the events are of one polarity"
+    if blind_for or not num_on or not num_off:
+        why = "the sensor misses changes while it is blind" if blind_for else "the events are of one polarity"
         assumed = Estimate(ASSUMED_THRESHOLD, math.inf, f"{why}, so that both thresholds are assumed to be equal")
         return assumed, assumed, False
     counts = index.offsets.diff().numpy()

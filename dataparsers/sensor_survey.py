@@ -57,7 +57,8 @@ class SensorSurvey:
         """
         index = index_events(recording)
         period = refractory_period(index)
-        on, off, is_measured = contrast_thresholds(recording, bool(recording.refractory_period or period))
+        blind_for = recording.refractory_period or (round(period.value) if period else 0)
+        on, off, is_measured = contrast_thresholds(recording, blind_for)
         thresholds = on.value, off.value
         return cls(
             recording,

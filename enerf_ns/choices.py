@@ -503,7 +503,7 @@ class _Resolver:
             nonlocal assumed
             if recording.contrast_thresholds is not None:
                 return recording.contrast_thresholds
-            assumed = contrast_thresholds(recording, bool(blind))
+            assumed = contrast_thresholds(recording, blind)
             return assumed[0].value, assumed[1].value
 
         on, off = self.use(name, from_recording)
@@ -588,7 +588,7 @@ class _Resolver:
         weight = self.use(name, lambda: self.config.defaults.level_loss_weight if alone else 0.0)
         why = "events leave the level of brightness open" if alone else "frames tell the level of brightness"
         level = self.use("model.mean_brightness", self._mean_brightness if weight else lambda: MEAN_BRIGHTNESS)
-        why = self.why("model.mean_brightness", why)
+        why = self.why("model.mean_brightness", why) if weight else why
         value = f"held near {level:.3g}{self._level_from}"
         self.row("level of brightness", bool(weight), value, self.why(name, why), name)
 

@@ -285,10 +285,9 @@ class EnerfModel(Model):
             ray_bundle: Any rays; in training usually a `PairedRayBundle`.
 
         Returns:
-            rgb (rays, 3), at most 1 (where a level of brightness is held, its share of `MEAN_BRIGHTNESS`) but where
-            brightness is exponential, and accumulation (rays, 1). In training rgb
-            has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in scene
-            units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1] and confidence (rays, 1) of
+            rgb (rays, 3), at most `gain` but where brightness is exponential, and accumulation (rays, 1). In training
+            rgb has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in
+            scene units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1] and confidence (rays, 1) of
             `depth_evidence`, which are computed when they are asked for, by their name.
         """
         if ray_bundle.nears is None:
@@ -411,7 +410,7 @@ class EnerfModel(Model):
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
             if "event_loss" in losses and "instant_loss" in losses:
                 of_events, of_any, number = losses["event_loss"], losses["instant_loss"], batch.events.num_any
-                share = 1.0 / (1.0 + self.instant_balance(of_events, batch.events.num_pairs, of_any, number))
+                share = 1.0 / (1.0 + self.instant_balance(of_events, batch.events.num_of_events, of_any, number))
                 losses |= {"event_loss": share * of_events, "instant_loss": (1.0 - share) * of_any}
             if self.training and self.sensor.threshold_map is not None:
                 self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
@@ -426,7 +425,7 @@ class EnerfModel(Model):
             weight = config.frame_loss_weight
             if self.frame_balance and batch.events is not None and "event_loss" in losses:
                 of_events = losses["event_loss"].detach() / share / config.event_loss_weight
-                weight = share * self.frame_balance(of_events, batch.events.num_pairs, error, len(frames))
+                weight = share * self.frame_balance(of_events, batch.events.num_of_events, error, len(frames))
             losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]

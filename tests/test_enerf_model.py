@@ -177,7 +177,7 @@ def test_pairs_of_any_instants_are_weighed_by_the_errors_of_both(pipeline: Any, 
     model = pipeline.model
     outputs = model(rays)
     events = batch.events
-    number = events.num_pairs // 3
+    number = events.num_of_events // 3
     some = replace(batch, events=replace(events, num_any=number))
     start, end, _ = batch.split(outputs["rgb"])
     means = model.supervision.losses(start, end, some.events, model.sensor)
@@ -185,7 +185,7 @@ def test_pairs_of_any_instants_are_weighed_by_the_errors_of_both(pipeline: Any, 
     model.frame_balance = ErrorBalance() if frames_are_weighed else None
     losses = model.get_loss_dict(outputs, some)
     model.instant_balance, model.frame_balance = ErrorBalance(), None
-    numbers = {"event_loss": events.num_pairs - number, "instant_loss": number}
+    numbers = {"event_loss": events.num_of_events - number, "instant_loss": number}
     shares = {name: numbers[name] / float(means[name]) for name in numbers}
     for name in numbers:
         torch.testing.assert_close(losses[name], shares[name] / sum(shares.values()) * means[name])

@@ -53,14 +53,14 @@ class EventBatch:
         return slice(len(self) - self.num_silent)
 
     @property
-    def num_pairs(self) -> int:
+    def num_of_events(self) -> int:
         """Number of pairs of events."""
         return len(self) - self.num_silent - self.num_any
 
     @property
     def of_events(self) -> slice:
         """Which pairs are of events."""
-        return slice(self.num_pairs)
+        return slice(self.num_of_events)
 
     @property
     def of_any(self) -> slice:

@@ -89,6 +89,16 @@ def test_a_period_is_told_of_brightness_that_takes_as_long_again_to_turn_back(th
     assert abs(found.value - 8e6) < found.error < 3e6
 
 
+def test_thresholds_are_those_of_a_blind_sensor_also_where_only_a_flag_says_that_it_is(tmp_path: Path):
+    frames = np.arange(1, 100) * 10_000_000
+    recording = recording_of(events_of_waves((0.06, 0.04), 1.0, 8_000_000), tmp_path, frames)
+    assert refractory_period(index_events(recording)) is None and not recording.refractory_period
+    on, off, is_measured = contrast_thresholds(recording, 8_000_000)
+    assert is_measured and abs(on.value - 0.06) < 2 * on.error and abs(off.value - 0.04) < 2 * off.error
+    taken_for_one_that_sees_all, _, _ = contrast_thresholds(recording, 0)
+    assert abs(taken_for_one_that_sees_all.value - 0.06) > 2 * on.error
+
+
 def test_a_short_recording_tells_nothing():
     few = poisson(8e6, pixels=50)
     assert len(few) == 5000 and refractory_period(few) is None
@@ -201,7 +211,7 @@ def test_the_difference_of_the_thresholds_of_a_pixel_is_the_slope_of_its_sum(mon
 
 def test_the_counts_of_both_polarities_tell_the_ratio_and_the_mean_is_assumed(tmp_path: Path):
     recording = recording_of(events_of_waves((0.14, 0.1), 2.0), tmp_path)
-    on, off, is_measured = contrast_thresholds(recording, blind=False)
+    on, off, is_measured = contrast_thresholds(recording, blind_for=0)
     assert not is_measured and (on.value + off.value) / 2 == pytest.approx(ASSUMED_THRESHOLD)
     assert on.value / off.value == pytest.approx(1.4, rel=0.03) and abs(on.value - 0.25 * 2.8 / 2.4) < 3 * on.error
     assert 0 < on.error < 0.02 and 0 < off.error < 0.02
@@ -209,14 +219,14 @@ def test_the_counts_of_both_polarities_tell_the_ratio_and_the_mean_is_assumed(tm
 
 def test_counts_of_a_blind_sensor_tell_nothing(tmp_path: Path):
     recording = recording_of(events_of_waves((0.14, 0.1), 1.0, 20_000_000), tmp_path)
-    on, off, is_measured = contrast_thresholds(recording, blind=True)
+    on, off, is_measured = contrast_thresholds(recording, blind_for=8_000_000)
     assert (on.value, off.value, on.error, off.error, is_measured) == (0.25, 0.25, math.inf, math.inf, False)
 
 
 def test_events_of_one_polarity_tell_nothing(tmp_path: Path):
     times, pixels = np.repeat(np.arange(1, 100) * 10**7, 64), np.tile(np.arange(64), 99)
     events = Events(pixels % 8, pixels // 8, times, np.ones(len(times), int))
-    on, off, is_measured = contrast_thresholds(recording_of(events, tmp_path), blind=False)
+    on, off, is_measured = contrast_thresholds(recording_of(events, tmp_path), blind_for=0)
     assert (on.value, off.value, on.error, off.error, is_measured) == (0.25, 0.25, math.inf, math.inf, False)
 
 
@@ -245,7 +255,7 @@ def test_simulated_sensors_are_told(tmp_path: Path, sensor: SensorSettings, nois
         assert period is None or abs(period.value - 1e6) < 3 * period.error
     else:
         assert period is None
-    on, off, is_measured = contrast_thresholds(recording, blind=truth["refractory_period"] > 0)
+    on, off, is_measured = contrast_thresholds(recording, blind_for=truth["refractory_period"])
     if is_measured:
         assert abs(on.value - true_on) < 3 * on.error and abs(off.value - true_off) < 3 * off.error
     assert is_measured or truth["refractory_period"]

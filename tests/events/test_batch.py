@@ -26,7 +26,7 @@ def test_pairs_of_any_instants_come_between_those_of_events_and_silent_ones():
     joined = events(3, 0, False).followed_by(some).followed_by(events(2, 200, True))
     parts = (joined.of_events, joined.of_any, joined.silent)
     assert [joined.pixels[part].tolist() for part in parts] == [[0, 1, 2], [100, 101], [200, 201]]
-    assert joined.num_pairs == 3 and joined.pixels[joined.fired].tolist() == [0, 1, 2, 100, 101]
+    assert joined.num_of_events == 3 and joined.pixels[joined.fired].tolist() == [0, 1, 2, 100, 101]
     subset = joined.subset(torch.tensor([True, False, True, False, True, False, True]))
     parts = (subset.of_events, subset.of_any, subset.silent)
     assert [subset.pixels[part].tolist() for part in parts] == [[0, 2], [101], [201]]

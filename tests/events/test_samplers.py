@@ -662,7 +662,7 @@ def test_pairs_of_any_instants_tell_what_the_events_between_add_up_to(equal_stam
     stretches = torch.tensor(STRETCHES, device=device) if gaps else None
     sampler = InstantPairSampler(index_of(pixels, device), START, END, longest, stretches)
     batch = sampler.sample(4000, torch.Generator(device).manual_seed(0))
-    assert batch.num_silent == batch.num_pairs == 0 and batch.num_any == len(batch)
+    assert batch.num_silent == batch.num_of_events == 0 and batch.num_any == len(batch)
     assert not batch.starts_at_events and batch.ahead is not None
     rows = zip(*(column.tolist() for column in (*batch.columns, batch.ahead)), strict=True)
     for pixel, start, end, on, off, ahead in rows:
