@@ -17,6 +17,7 @@ from typing import Annotated, Literal, Optional, Tuple, Type  # noqa: UP035 - ty
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Float64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -137,26 +138,9 @@ class EventDataParser(DataParser):
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
         frames, are_frames = split_frames(recording, self.config, held_out=split != "train")
 
-        poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
-        camera_to_scene = np.einsum("ij,njk->nik", transform[:, :3], poses)
-        camera_to_scene[..., 3] = scale * (camera_to_scene[..., 3] + transform[:, 3])
-        camera_to_scene[..., :3] = camera_to_scene[..., :3] @ OPENGL_FROM_OPENCV
-
-        camera = frames.picture_camera
-        cameras = Cameras(
-            camera_to_worlds=torch.from_numpy(camera_to_scene).float(),
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx + 0.5,
-            cy=camera.cy + 0.5,
-            width=camera.width,
-            height=camera.height,
-            camera_type=CameraType.PERSPECTIVE,
-            metadata={},
-        )
         return EventDataparserOutputs(
             image_filenames=list(frames.filenames),
-            cameras=cameras,
+            cameras=scene_cameras(frames, torch.from_numpy(transform), scale),
             scene_box=SceneBox(aabb=torch.from_numpy(box).float()),
             metadata={
                 "recording": recording,
@@ -167,6 +151,32 @@ class EventDataParser(DataParser):
             dataparser_transform=torch.from_numpy(transform).float(),
             dataparser_scale=scale,
         )
+
+
+def scene_cameras(frames: Frames, transform: Float64[torch.Tensor, "3 4"], scale: float) -> Cameras:
+    """Nerfstudio's cameras of frames.
+
+    Args:
+        frames: In the recording's world.
+        transform, scale: Of the scene, as of `PosedCamera`.
+    """
+    rotation, shift = transform[:, :3].numpy(), transform[:, 3].numpy()
+    poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
+    camera_to_scene = np.einsum("ij,njk->nik", rotation, poses)
+    camera_to_scene[..., 3] = scale * (camera_to_scene[..., 3] + shift)
+    camera_to_scene[..., :3] = camera_to_scene[..., :3] @ OPENGL_FROM_OPENCV
+    camera = frames.picture_camera
+    return Cameras(
+        camera_to_worlds=torch.from_numpy(camera_to_scene).float(),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx + 0.5,
+        cy=camera.cy + 0.5,
+        width=camera.width,
+        height=camera.height,
+        camera_type=CameraType.PERSPECTIVE,
+        metadata={},
+    )
 
 
 class EventDataparserOutputs(DataparserOutputs):

@@ -48,6 +48,8 @@ def index_events(recording: EventRecording) -> EventIndex:
             two events at every pixel.
         OutputError: More events than a quarter of the memory holds, and no room for their index on disk.
     """
+    if recording.as_read is not None:
+        return index_events(recording.as_read)
     camera, (start, end) = recording.camera, recording.span
     first = next((int(events.t[0]) for events in recording.stream_events() if len(events)), None)
     if first is None:

@@ -257,6 +257,8 @@ class EventRecording:
     """Whether pixels that fire far more often than their neighbourhood are used."""
     keep_pose_gaps: bool = False
     """Whether instants within the gaps of the trajectory are used."""
+    as_read: EventRecording | None = None
+    """The recording as it was read, of one whose poses or camera were refined: the events are the same."""
     event_file_states: tuple[tuple[str, int, int, int], ...] = ()
     """Path, size in bytes, and times of modification and of change (ns) of each of `event_files` when they were looked
     at; taken here unless given."""

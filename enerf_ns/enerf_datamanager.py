@@ -37,6 +37,7 @@ from enerf_ns.events.samplers import (
     SilentIntervalSampler,
     SilentPixelSampler,
 )
+from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.ray_samplers import PairedRayBundle
 from enerf_ns.sensor.sensor_model import SensorModel
@@ -323,10 +324,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             places: Where in its pixel rays go through, x and y from the centre in pixels: of each instant as many rays,
                 one after the other. None: the centre.
         """
-        delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
-        if delays is not None:
-            delays[batch.silent] = 0.0
-            delays = torch.cat([delays, torch.zeros_like(delays)])
+        delays = self._delays(batch, sensor)
         pixels, times = batch.pixels.repeat(2), torch.cat([batch.start, batch.end])
         if places is None:
             return self.event_camera.rays(pixels, times, delays)
@@ -334,6 +332,27 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         delays = None if delays is None else delays.repeat_interleave(number)
         pixels, times = (column.repeat_interleave(number) for column in (pixels, times))
         return self.event_camera.rays(pixels, times, delays, places=places.repeat(2 * len(batch), 1))
+
+    def event_times(self, batch: EventBatch, sensor: SensorModel) -> Int64[Tensor, " rays"]:
+        """When the pixels of a batch look along the rays of `event_rays`, ns."""
+        delays, times = self._delays(batch, sensor), torch.cat([batch.start, batch.end])
+        return times if delays is None else times + delays.round().long()
+
+    def _delays(self, batch: EventBatch, sensor: SensorModel) -> Tensor | None:
+        """How much later (ns) than at their instants pixels see again, of all first instants and then of all second
+        ones; None where they always do."""
+        delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
+        if delays is None:
+            return None
+        delays[batch.silent] = 0.0
+        return torch.cat([delays, torch.zeros_like(delays)])
+
+    def correct(self, corrections: Corrections) -> None:
+        """Has rays follow corrected poses, and through a corrected lens, and the cameras of frames too."""
+        for dataset in (self.train_dataset, self.eval_dataset):
+            dataset.correct(corrections)
+        for name in ("event_camera", "event_camera_without_distortion", "frame_camera"):
+            self.__dict__.pop(name, None)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
         """Rays of pixels drawn evenly from the train cameras, as ns-export looks at a scene with; training itself takes

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import TYPE_CHECKING, Annotated, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.models.base_model import Model
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -30,6 +32,16 @@ from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
+from enerf_ns.poses.refiner import (
+    FIRST_STEP,
+    FROZEN_FROM,
+    LOOK_EVERY,
+    LOOKS_A_SOLUTION,
+    PAIRS,
+    PoseRefiner,
+    RefinerConfig,
+    render_slopes,
+)
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.stopwatch import Stopwatch
@@ -65,6 +77,7 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
     _target: Type = field(default_factory=lambda: EnerfPipeline)  # noqa: UP006
     datamanager: EnerfDataManagerConfig = field(default_factory=EnerfDataManagerConfig)
     model: EnerfModelConfig = field(default_factory=EnerfModelConfig)
+    poses: Annotated[RefinerConfig, tyro.conf.arg(name="")] = field(default_factory=RefinerConfig)
     defaults: Fixed[Suppress[MethodDefaults]] = field(default_factory=MethodDefaults)
     """What is used where neither flag nor preset says otherwise."""
     resolution: Fixed[Suppress[Resolution]] = field(default_factory=Resolution)
@@ -89,8 +102,10 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
             return self._target(filled, **kwargs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before choices were stored apart from what was set, too."""
-        self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), **state})
+        """Reads config.yml of runs from before choices were stored apart from what was set, and before poses were
+        refined, too."""
+        as_read = RefinerConfig(refine_clock=False, refine_mount=False, refine_lens=False, refine_drift=False)
+        self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), "poses": as_read, **state})
 
 
 @dataclass(frozen=True)
@@ -121,12 +136,19 @@ class EnerfPipeline(VanillaPipeline):
         super().__init__(config, device, **kwargs)
         self.stopwatch = Stopwatch(device)
         """Is told where each part of a step ends."""
+        self.num_steps: float = math.inf
+        """Steps of the training that are known to come, towards whose end poses stay as they are."""
+        self._pose_generator = torch.Generator().manual_seed(0)
         self.seconds_a_step: float | None = None
         """What a training step will take; None where nobody needs to know, since it is small."""
         trains = kwargs.get("test_mode", "val") == "val"
         self._fit_memory(trains)
         if trains:
             self._start_threshold_map()
+        self.poses: PoseRefiner | None = None
+        if "events" in config.datamanager.supervision and world_size == 1:
+            self.poses = PoseRefiner(config.poses, self.datamanager.recording)
+            self._correct_poses()
         self._viewer: ViewerControl | None = None
         self.model.seen_volume = self.seen_volume
         self.world_size = world_size
@@ -216,9 +238,49 @@ class EnerfPipeline(VanillaPipeline):
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         detached = {name: loss.detach() for name, loss in losses.items()}
+        if self.training and self.poses is not None and batch.events is not None:
+            self._refine_poses(self.poses, batch.events, step)
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
         self.stopwatch.lap("losses")
         return outputs, losses, metrics
+
+    def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
+        """Has the poses corrected, now and then, by what pairs of a training step tell."""
+        if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % LOOK_EVERY:
+            return
+        manager, sensor, model = self.datamanager, self.model.sensor, self.model
+        fired = batch.fired.stop
+        chosen = torch.zeros(len(batch), dtype=torch.bool)
+        chosen[torch.randperm(fired, generator=self._pose_generator)[:PAIRS]] = True
+        some = batch.subset(chosen.to(batch.pixels.device))
+        rays = manager.event_rays(some, sensor)
+        times = manager.event_times(some, sensor)
+        camera = manager.event_camera
+        unit = float(sensor.mean_threshold)
+        logs, slopes = render_slopes(
+            model,
+            rays,
+            lambda rgb: sensor.log_brightness(rgb, some.pixels.repeat(2)) / unit,
+            camera.axes(times),
+            camera.scale,
+        )
+        start, end = logs.chunk(2)
+        with torch.no_grad():
+            residual = sensor.measured_change(some) / unit - (end - start)
+        refiner.look(
+            residual.double().cpu().numpy(), slopes, times.view(2, -1).cpu().numpy(), some.pixels.cpu().numpy()
+        )
+        if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve():
+            self._correct_poses()
+
+    def _correct_poses(self) -> None:
+        """Has rays, and held-out frames, follow the poses as they are corrected by now."""
+        if self.poses is not None:
+            self.datamanager.correct(self.poses.corrections)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        super().load_pipeline(loaded_state, step)
+        self._correct_poses()
 
     @torch.no_grad()
     def _slopes(self, batch: EventBatch, number: int) -> Float[Tensor, "pairs 2"]:

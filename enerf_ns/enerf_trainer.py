@@ -184,7 +184,11 @@ class EnerfTrainerConfig(TrainerConfig):
         with torch.random.fork_rng():
             model: EnerfModel = filled.model.setup(scene_box=box, num_train_data=0)
         state = load_checkpoint(checkpoint)
-        stored = {name.replace("_model.module.", "_model."): value for name, value in state["pipeline"].items()}
+        stored = {
+            name.replace("_model.module.", "_model."): value
+            for name, value in state["pipeline"].items()
+            if name.startswith("_model.")
+        }
         here = model.state_dict(prefix="_model.")
         shapes = [
             [name, *(tuple(side[name].shape) if name in side else "missing" for side in (stored, here))]
@@ -331,6 +335,7 @@ class EnerfTrainer(Trainer):
                 super().setup(test_mode)
         finally:
             config.data = data
+        self.pipeline.num_steps = config.max_num_iterations
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )

@@ -9,10 +9,12 @@ import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
+from enerf_ns.dataparsers.event_dataparser import scene_cameras
 from enerf_ns.dataparsers.event_index import event_picture
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.poses.corrections import Corrections
 
 
 class EventDataset(InputDataset):
@@ -23,8 +25,19 @@ class EventDataset(InputDataset):
         self.recording: EventRecording = self.metadata["recording"]
         frames: Frames = self.metadata["frames"]
         self.frames = replace(frames, downscale_factor=frames.downscale_factor / scale_factor)
+        self._as_read, self._scale = (self.recording, self.frames), dataparser_outputs.dataparser_scale
         self.are_frames: bool = self.metadata["are_frames"]
         """Whether the pictures are frames; otherwise they show events."""
+
+    def correct(self, corrections: Corrections) -> None:
+        """Has the recording, and the cameras of the pictures, be as they are with corrected poses and lens; views on a
+        trajectory of their own stay as they are."""
+        given, frames = self._as_read
+        self.recording = corrections.recording(given)
+        own = given.held_out_frames
+        if own is None or frames.trajectory is not own.trajectory:
+            self.frames = corrections.frames(frames, given)
+        self.cameras = scene_cameras(self.frames, self.metadata["transform"], self._scale)
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """Picture of shape (height, width, 3): uint8, or float32 in [0, 1] of frames of more than 8 bits."""

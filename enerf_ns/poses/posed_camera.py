@@ -93,6 +93,10 @@ class PosedCamera:
             metadata={"directions_norm": norms},
         )
 
+    def axes(self, times: Int64[Tensor, " rays"]) -> Float[Tensor, "rays 3 3"]:
+        """Rotations from the axes of the camera at some times (ns) to those of the scene."""
+        return (self._transform[:, :3] @ self.trajectory.poses(times)[..., :3]).float()
+
     @cached_property
     def _steps(self) -> tuple[Tensor, Tensor]:
         """`Camera.pixel_steps`, a row for each pixel, on the device."""

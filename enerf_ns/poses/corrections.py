@@ -1,0 +1,205 @@
+"""What is wrong with clock, mount, lens and trajectory of a recording, in numbers, and the recording without it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.trajectory import Trajectory
+
+MILLISECOND = 1_000_000
+
+
+@dataclass(frozen=True)
+class DriftBasis:
+    """Smooth functions of time without mean: cubic B-splines between evenly spaced knots, less one of their sums."""
+
+    start: int
+    """First and last time, ns; before and after, the functions stay as they are there."""
+    end: int
+    num_pieces: int
+    """Number of equal parts of the time between which the knots lie."""
+
+    @property
+    def size(self) -> int:
+        """Number of functions."""
+        return self.num_pieces + 2
+
+    def at(self, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times functions"]:
+        """The functions at some times, ns."""
+        splines, without_mean = self._parts
+        return splines((times - self.start).clip(0, self.end - self.start) / (self.end - self.start)) @ without_mean
+
+    @cached_property
+    def roughness(self) -> Float64[np.ndarray, "functions functions"]:
+        """Sum of the squared second differences of the splines' coefficients, as a quadratic form of those of the
+        functions (P-splines, Eilers and Marx, Statistical Science 1996)."""
+        bends = np.diff(self._parts[1], n=2, axis=0)
+        return bends.T @ bends
+
+    @cached_property
+    def _parts(self) -> tuple[BSpline, Float64[np.ndarray, "splines functions"]]:
+        """The splines, and as columns the orthonormal combinations of them that have no mean."""
+        knots = np.pad(np.linspace(0.0, 1.0, self.num_pieces + 1), 3, mode="edge")
+        splines = BSpline(knots, np.eye(self.num_pieces + 3), 3)
+        means = (knots[4:] - knots[:-4]) / 4.0
+        return splines, np.linalg.svd(means[None])[2][1:].T
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """By what clocks, poses and lens of a recording are wrong: the camera of the events has at time t the pose
+    T(t + delay) Exp(mount) Exp(drift(t)), where T is the given trajectory; in the axes of the camera, shift and rotation
+    apart, as `PosedCamera.rays` has corrections."""
+
+    delay: float = 0.0
+    """Milliseconds by which the given poses are stamped later than events of the same instant."""
+    frame_delay: float = 0.0
+    """Milliseconds by which frames are stamped later than events of the same instant."""
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector of the camera against what it is mounted on, radians."""
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift of the camera against what it is mounted on, metres."""
+    focal_scale: float = 1.0
+    """The focal length as a multiple of the stated one."""
+    distortion: float = 0.0
+    """What the first coefficient of radial distortion is more than stated."""
+    basis: DriftBasis | None = None
+    drift: Float64[np.ndarray, "functions 6"] | None = None
+    """Coefficients of the drift, of shifts in metres and of rotation vectors in radians. None: there is none."""
+
+    @property
+    def moves_poses(self) -> bool:
+        """Whether poses of the camera of the events are others than those given."""
+        return self.delay != 0.0 or any(self.rotation) or any(self.translation) or self.drift is not None
+
+    @property
+    def changes_lens(self) -> bool:
+        """Whether the camera of the events is another one than that given."""
+        return self.focal_scale != 1.0 or self.distortion != 0.0
+
+    def camera(self, given: Camera) -> Camera:
+        """The camera of the events, of the same size.
+
+        Raises:
+            ValueError: There is no such lens.
+        """
+        if not self.changes_lens:
+            return given
+        model, coefficients = given.model, given.distortion
+        if self.distortion and model == "pinhole":
+            model, coefficients = "radtan", (self.distortion, 0.0, 0.0, 0.0)
+        elif self.distortion:
+            coefficients = (coefficients[0] + self.distortion, *coefficients[1:])
+        scale = self.focal_scale
+        directions = None if given.directions is None else given.directions / scale
+        return replace(
+            given,
+            fx=given.fx * scale,
+            fy=given.fy * scale,
+            model=model,
+            distortion=coefficients,
+            directions=directions,
+        )
+
+    def poses(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
+        """Poses of the camera of the events, at any times (ns): beyond the given poses it goes on at its last speed."""
+        poses = poses_at(given, times + round(MILLISECOND * self.delay))
+        poses = _moved(poses, np.array([self.translation]), np.array([self.rotation]))
+        if self.basis is not None and self.drift is not None:
+            values = self.basis.at(times) @ self.drift
+            poses = _moved(poses, values[:, :3], values[:, 3:])
+        return poses
+
+    def trajectory(self, given: Trajectory) -> Trajectory:
+        """The trajectory of the camera of the events, from the same first to the same last time."""
+        if not self.moves_poses:
+            return given
+        times = _inner_times(given, self.delay)
+        return _trajectory(times, self.poses(given, times))
+
+    def frames(self, given: Frames, recording: EventRecording) -> Frames:
+        """Frames of a recording with the poses of their camera. Their stamps stay: what their clock is wrong by is taken
+        into the trajectory. A camera of their own keeps its lens, and its pose against the camera of the events."""
+        camera = self.camera(given.camera) if given.camera == recording.camera else given.camera
+        if not self.moves_poses and not self.frame_delay:
+            return given if camera is given.camera else replace(given, camera=camera)
+        of_events, of_frames = recording.trajectory, given.trajectory
+        if of_frames is of_events and not self.frame_delay:
+            return replace(given, camera=camera, trajectory=self.trajectory(of_events))
+        frame_shift = -round(MILLISECOND * self.frame_delay)
+        times = _inner_times(of_frames, self.delay - self.frame_delay)
+        poses = self.poses(of_events, times + frame_shift)
+        if of_frames is not of_events:
+            stamped = times + frame_shift + round(MILLISECOND * self.delay)
+            before, own = poses_at(of_events, stamped), poses_at(of_frames, stamped)
+            back = before[:, :, :3].transpose(0, 2, 1)
+            mount = back @ np.concatenate([own[:, :, :3], own[:, :, 3:] - before[:, :, 3:]], axis=2)
+            rotation = poses[:, :, :3]
+            moved = rotation @ mount
+            moved[:, :, 3] += poses[:, :, 3]
+            poses = moved
+        return replace(given, camera=camera, trajectory=_trajectory(times, poses))
+
+    def recording(self, given: EventRecording) -> EventRecording:
+        """A recording with the camera and the poses that it should have had; events and frames are the same files."""
+        if not (self.moves_poses or self.changes_lens or self.frame_delay):
+            return given
+        frames, blurred = (
+            None if kind is None else self.frames(kind, given) for kind in (given.frames, given.blurred_frames)
+        )
+        return replace(
+            given,
+            camera=self.camera(given.camera),
+            trajectory=self.trajectory(given.trajectory),
+            frames=frames,
+            blurred_frames=blurred,
+            as_read=given,
+        )
+
+
+def poses_at(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
+    """Camera-to-world matrices [R | t] at any times (ns): before the first pose, and after the last one, the camera goes
+    on at the speed, and turns at the rate, that it has between the last two."""
+    inside = times.clip(trajectory.start, trajectory.end)
+    poses = trajectory.poses(torch.from_numpy(inside)).numpy()
+    ends = (trajectory.times[:2], times < trajectory.start), (trajectory.times[:-3:-1], times > trajectory.end)
+    for (last, other), beyond in ends:
+        if beyond.any():
+            first, second = trajectory.poses(torch.tensor([last, other])).numpy()
+            steps = ((times[beyond] - last) / (other - last))[:, None]
+            turn = Rotation.from_matrix(first[:, :3].T @ second[:, :3]).as_rotvec()
+            poses[beyond, :, :3] = first[:, :3] @ Rotation.from_rotvec(steps * turn).as_matrix()
+            poses[beyond, :, 3] = first[:, 3] + steps * (second[:, 3] - first[:, 3])
+    return poses
+
+
+def _moved(
+    poses: Float64[np.ndarray, "poses 3 4"],
+    shifts: Float64[np.ndarray, "#poses 3"],
+    turns: Float64[np.ndarray, "#poses 3"],
+) -> Float64[np.ndarray, "poses 3 4"]:
+    """Poses of cameras that are shifted (metres), and turned (rotation vectors), in their own axes."""
+    rotation = poses[:, :, :3]
+    position = poses[:, :, 3] + (rotation @ shifts[:, :, None])[..., 0]
+    return np.concatenate([rotation @ Rotation.from_rotvec(turns).as_matrix(), position[..., None]], axis=-1)
+
+
+def _inner_times(given: Trajectory, delay: float) -> Int64[np.ndarray, " poses"]:
+    """Times (ns) at which a trajectory has poses when its clock is set back by a delay (ms), within its span, and the
+    ends of that."""
+    times = given.times - round(MILLISECOND * delay)
+    inside = times[(times > given.start) & (times < given.end)]
+    return np.concatenate([[given.start], inside, [given.end]])
+
+
+def _trajectory(times: Int64[np.ndarray, " poses"], poses: Float64[np.ndarray, "poses 3 4"]) -> Trajectory:
+    return Trajectory(times, poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat())
