@@ -107,6 +107,81 @@ class CornerFit:
     least_miss: float
 
 
+class _Trials:
+    """What was tried of a recording, each hypothesis once."""
+
+    def __init__(self, focus: EventFocus):
+        self.focus = focus
+        self.tried: dict[Hypothesis, Float64[np.ndarray, " samples"]] = {}
+
+    def curve(self, hypotheses: list[Hypothesis]) -> Float64[np.ndarray, "hypotheses samples"]:
+        """The sharpness of each sample of events under each hypothesis."""
+        for hypothesis in hypotheses:
+            if hypothesis not in self.tried:
+                self.tried[hypothesis] = self.focus.sharpness(hypothesis)
+        return np.stack([self.tried[hypothesis] for hypothesis in hypotheses])
+
+    def delay(self, reading: Reading, scale: float) -> Estimate:
+        """Of the poses, milliseconds, with a focal length."""
+        return _delay(
+            lambda delays: self.curve([Hypothesis(delay, scale, reading) for delay in delays.tolist()]),
+            self.focus.largest_delay,
+        )
+
+    def focal_scale(self, reading: Reading, delay: Estimate, lens: float) -> Estimate:
+        """The best focal length around that of a lens, both as multiples of the stated one, with a delay if told."""
+        scales, known = [lens * scale for scale in FOCAL_SCALES], delay.value * delay.is_told
+        scales = [scale for scale in scales if self.focus.allows(scale)]
+        curves = self.curve([Hypothesis(round(known * MILLISECOND), scale, reading) for scale in scales])
+        largest = max(LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE * abs(lens - 1))
+        return _estimate(np.array(scales), curves, lens * SCALE_REACH, largest)
+
+
+def clock_and_lens(recording: EventRecording, distance: float) -> tuple[Estimate, Estimate] | None:
+    """The delay of the poses (ms), and the focal length (a multiple of the stated one), that make events sharpest.
+
+    Takes about two seconds.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        distance: Usual depth of the scene, metres.
+
+    Returns:
+        None where the events are too few, or the time is too short, to say anything. A camera that hardly turns does
+        not tell a focal length.
+    """
+    trials = _Trials(EventFocus(recording, distance))
+    if not trials.focus.windows:
+        return None
+    delay = trials.delay(AS_READ, 1.0)
+    if trials.focus.turn < SMALLEST_TURN:
+        return delay, Estimate(1.0, math.inf, False)
+    scale = trials.focal_scale(AS_READ, delay, 1.0)
+    if scale.is_told and abs(scale.value - 1) > HARMFUL_SCALE / 2:  # either hides some of the other
+        delay = trials.delay(AS_READ, scale.value)
+        scale = trials.focal_scale(AS_READ, delay, 1.0)
+    return delay, scale
+
+
+def clock_of_frames(recording: EventRecording, depth_range: tuple[float, float]) -> Estimate | None:
+    """Milliseconds by which frames are stamped later than events of the same instant, by their edges.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        depth_range: Nearest and farthest depth, metres.
+
+    Returns:
+        None where there are too few frames, or events, to say anything.
+    """
+    focus = EventFocus(recording, math.sqrt(depth_range[0] * depth_range[1]))
+    edges = FrameEdges.of(recording, depth_range, focus.largest_delay)
+    if edges is None:
+        return None
+    plane = edges.best_plane(_coarse(focus.largest_delay))
+    early = _delay(lambda delays: edges.likeness(delays, plane), focus.largest_delay)
+    return Estimate(-early.value, early.error, early.is_told)
+
+
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """What events say about poses, clocks and the focal length."""
@@ -146,27 +221,8 @@ class Agreement:
         focus = EventFocus(recording, math.sqrt(near * far))
         if not focus.windows:
             return None
-        tried: dict[Hypothesis, np.ndarray] = {}
-
-        def curve(hypotheses: list[Hypothesis]) -> np.ndarray:
-            for hypothesis in hypotheses:
-                if hypothesis not in tried:
-                    tried[hypothesis] = focus.sharpness(hypothesis)
-            return np.stack([tried[hypothesis] for hypothesis in hypotheses])
-
-        def delay_of(reading: Reading, scale: float) -> Estimate:
-            return _delay(
-                lambda delays: curve([Hypothesis(delay, scale, reading) for delay in delays.tolist()]),
-                focus.largest_delay,
-            )
-
-        def scale_of(reading: Reading, delay: Estimate, lens: float) -> Estimate:
-            scales, known = [lens * scale for scale in FOCAL_SCALES], delay.value * delay.is_told
-            scales = [scale for scale in scales if focus.allows(scale)]
-            curves = curve([Hypothesis(round(known * MILLISECOND), scale, reading) for scale in scales])
-            largest = max(LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE * abs(lens - 1))
-            return _estimate(np.array(scales), curves, lens * SCALE_REACH, largest)
-
+        trials = _Trials(focus)
+        curve, delay_of, scale_of = trials.curve, trials.delay, trials.focal_scale
         pose_delay = delay_of(AS_READ, 1.0)
         stated = [Hypothesis(), Hypothesis(round(pose_delay.value * MILLISECOND))]
         other = _other_lens(focus, stated, curve) if focus.turn >= SMALLEST_TURN else None
@@ -194,7 +250,7 @@ class Agreement:
         apart = round((pose_delay.value - frame_delay.value) * MILLISECOND) if told and frame_delay else 0
         tracks = FrameTracks.of(recording)
         corners = None if tracks is None else _fit_corners(tracks, near / 2, apart)
-        total = {hypothesis: float(curves.sum()) for hypothesis, curves in tried.items()}
+        total = {hypothesis: float(curves.sum()) for hypothesis, curves in trials.tried.items()}
         return cls(focus, edges, plane, total, readings, is_clear, pose_delay, frame_delay, focal_scale, corners)
 
     def verdict(self) -> str:

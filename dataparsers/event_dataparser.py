@@ -77,6 +77,9 @@ class EventDataParserConfig(DataParserConfig):
     """Use what lies in gaps between poses, which are guesses there."""
     downscale_factor: Optional[float] = None  # noqa: UP045
     """How many times smaller than the frames their pictures are; events stay as they are. None: 1."""
+    smooth_poses: Optional[bool] = None  # noqa: UP045
+    """Take noise that is independent from pose to pose off the poses. None: where it moves the picture by more than a
+    tenth of a pixel."""
     undistort: bool = True
     """Undo the distortion of the lenses that the calibration states. False: as if there were none."""
     train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
@@ -101,7 +104,10 @@ class EventDataParser(DataParser):
         """The recording of this parser's folder, read once per process."""
         config = self.config
         time_range = config.time_range and (config.time_range[0], config.time_range[1])  # a list, from some YAML
-        selection = time_range, config.keep_hot_pixels, config.keep_pose_gaps, config.undistort
+        selection = (
+            *(time_range, config.keep_hot_pixels, config.keep_pose_gaps, config.undistort),
+            bool(config.smooth_poses),
+        )
         return read_recording(config.data, config.format, *selection, **vars(config.options))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:

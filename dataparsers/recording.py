@@ -18,6 +18,7 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import is_deep, load_array, load_image
 from enerf_ns.dataparsers.picture_depth import find_white_level
+from enerf_ns.dataparsers.pose_noise import pose_noise
 from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
@@ -283,6 +284,7 @@ class EventRecording:
         keep_hot_pixels: bool,
         keep_pose_gaps: bool = False,
         undistort: bool = True,
+        smooth_poses: bool = False,
     ) -> EventRecording:
         """The recording of which a part of the events is used; for one selection always the same object.
 
@@ -291,6 +293,7 @@ class EventRecording:
             keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
             keep_pose_gaps: Use instants within the gaps of the trajectory.
             undistort: Believe the distortion of the cameras; otherwise they have none.
+            smooth_poses: Take the noise off the poses (`pose_noise`).
 
         Raises:
             FlagError: The range holds no poses, or lies within a gap that is left out.
@@ -302,6 +305,8 @@ class EventRecording:
             selection = _with_selection(self, *chosen)
         if not undistort:
             selection = _without_lenses(selection)
+        if smooth_poses:
+            selection = _with_smooth_poses(selection)
         start, end = selection.span
         if time_range is not None and not start < end:
             raise FlagError(
@@ -486,6 +491,25 @@ def _with_selection(
     recording: EventRecording, time_range: tuple[int, int] | None, keep_hot_pixels: bool, keep_pose_gaps: bool
 ) -> EventRecording:
     return replace(recording, time_range=time_range, keep_hot_pixels=keep_hot_pixels, keep_pose_gaps=keep_pose_gaps)
+
+
+@cache
+def _with_smooth_poses(recording: EventRecording) -> EventRecording:
+    smooth = {id(recording.trajectory): _smooth(recording.trajectory)}
+
+    def of(frames: Frames | None) -> Frames | None:
+        if frames is None:
+            return None
+        found = smooth.setdefault(id(frames.trajectory), _smooth(frames.trajectory))
+        return replace(frames, trajectory=found)
+
+    frames, blurred = of(recording.frames), of(recording.blurred_frames)
+    return replace(recording, trajectory=smooth[id(recording.trajectory)], frames=frames, blurred_frames=blurred)
+
+
+def _smooth(trajectory: Trajectory) -> Trajectory:
+    noise = pose_noise(trajectory)
+    return trajectory if noise is None else noise.smooth
 
 
 @cache

@@ -16,11 +16,14 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from enerf_ns.dataparsers.agreement import Estimate as AgreementEstimate
+from enerf_ns.dataparsers.agreement import clock_and_lens, clock_of_frames
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
 from enerf_ns.dataparsers.frame_contrast import mean_brightness
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
+from enerf_ns.dataparsers.pose_noise import pose_noise
 from enerf_ns.dataparsers.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.sensor_estimates import (
@@ -38,7 +41,9 @@ from enerf_ns.enerf_field import LOG_SIGMOID_RANGE
 from enerf_ns.enerf_model import FRAME_LOSS_WEIGHT, MEAN_BRIGHTNESS, EnerfModelConfig
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.paper_selections import preset_named, selections
+from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.motion import exposure_motion
+from enerf_ns.poses.refiner import RefinerConfig
 from enerf_ns.sensor.response import ColourFilter, response_named
 from enerf_ns.sensor.sensor_model import GREY
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
@@ -68,6 +73,8 @@ class MethodDefaults:
     no_event_margin: float = 0.0
     level_loss_weight: float = 0.1
     """Where the field learns from events alone."""
+    refines_poses: bool = True
+    """Whether clock, mount, lens and drift of the poses are corrected where events show that they are wrong."""
     learns_sensor: bool = True
     """Whether what the recording does not state of its sensor is measured and learned, instead of assumed."""
     whole_preset: bool = False
@@ -137,11 +144,20 @@ SILENT_BORDER = 0.02
 """Share of a sensor's mean events a pixel below which its border is silent, as around an object before nothing."""
 
 
+LARGEST_NOISE = 0.1
+"""Pixels by which noise of the poses may move the picture before it is taken off."""
+
+SMALLEST_DELAY, SMALLEST_SCALE = 0.5, 0.02
+"""Delay (ms) of the poses, and share of the focal length, from which on refinement starts there; less it finds
+itself."""
+
+
 class PipelineConfig(Protocol):
     """The config of a pipeline, which is what gets resolved."""
 
     datamanager: EnerfDataManagerConfig
     model: EnerfModelConfig
+    poses: RefinerConfig
     defaults: MethodDefaults
 
 
@@ -240,8 +256,12 @@ class _Resolver:
         self.train_frames = self.use(f"{DATAPARSER}.train_frames", lambda: "blurred")
         time_range = self.use(f"{DATAPARSER}.time_range", lambda: None)
         parser = self.parser
-        selection = parser.keep_hot_pixels, parser.keep_pose_gaps, parser.undistort
-        self.recording = recording.selected(time_range, *selection)
+        selection = time_range, parser.keep_hot_pixels, parser.keep_pose_gaps, parser.undistort
+        self.recording = recording.selected(*selection)
+        self._of_poses = pose_noise(self.recording.trajectory)
+        name = f"{DATAPARSER}.smooth_poses"
+        if self.use(name, self._is_noisy):
+            self.recording = recording.selected(*selection, smooth_poses=True)
 
     @property
     def use_events(self) -> bool:
@@ -267,6 +287,11 @@ class _Resolver:
             self.values[name] = value
         return value
 
+    def _value(self, name: str) -> Any:
+        """What is used for a setting, as far as it is decided by now."""
+        value = attrgetter(name)(self.config)
+        return self.values.get(name) if value is None else value
+
     def why(self, name: str, otherwise: str) -> str:
         """Who decided a setting."""
         value = attrgetter(name)(self.config)
@@ -282,12 +307,16 @@ class _Resolver:
             name: Of the setting that forces it, within the config of the pipeline.
         """
         prefix, _, setting = name.rpartition(".")
-        prefix = {DATAPARSER: "event-data --", "model.sensor": "--pipeline.model."}.get(prefix, f"--pipeline.{prefix}.")
+        prefix = {DATAPARSER: "event-data --", "model.sensor": "--pipeline.model.", "poses": "--pipeline."}.get(
+            prefix, f"--pipeline.{prefix}."
+        )
         self.choices.append(Choice(part, kept, value, why, prefix + setting.replace("_", "-")))
 
     def resolution(self) -> Resolution:
         self._split()
         self._poses()
+        self._pose_noise()
+        self._clock_and_lens()
         self._events()
         self._silent_pixels()
         self._sensor()
@@ -344,6 +373,70 @@ class _Resolver:
         index = index_events(recording)
         why = f"{index.num_in_gaps:,} events ({percent(index.num_in_gaps / len(index))}) lie in {describe_gaps(gaps)}"
         self.row("pose gaps", kept, "used" if kept else "left out", "set by flag; " * kept + why, name)
+
+    def _is_noisy(self) -> bool:
+        """Whether noise of the poses matters."""
+        noise = self._of_poses
+        return noise is not None and noise.pixels(self.recording.camera.fx, self._distance) > LARGEST_NOISE
+
+    @property
+    def _distance(self) -> float:
+        """About how far away (m) the scene is, before that is known: as far as the camera goes."""
+        near, far = self.parser.depth_range or self.recording.depth_range or 2 * (_path_extent(self.recording) or 1.0,)
+        return math.sqrt(near * far)
+
+    def _pose_noise(self) -> None:
+        """Whether what is white noise of the poses is taken off."""
+        name = f"{DATAPARSER}.smooth_poses"
+        smooth = bool(self._value(name))
+        noise = self._of_poses
+        if noise is None:
+            self.row("noise of poses", smooth, "", "there are too few poses, or too many, to tell it", name)
+            return
+        pixels = noise.pixels(self.recording.camera.fx, self._distance)
+        value = f"{1e3 * noise.position:.2g} mm and {math.degrees(noise.rotation):.2g} degrees are taken off"
+        why = f"it moves the picture by {pixels:.2g} pixels"
+        self.row("noise of poses", smooth, value * smooth, self.why(name, why), name)
+
+    def _clock_and_lens(self) -> None:
+        """Where the refinement of poses and lens starts."""
+        poses, recording, refines = self.config.poses, self.recording, self.config.defaults.refines_poses
+        parts = ("clock", "mount", "lens", "drift")
+        for part in parts:
+            stated = {"clock": poses.clock_ms, "lens": poses.focal_scale}.get(part)
+            refined = getattr(poses, f"refine_{part}")
+            if refined is None and (stated is not None or not refines or not self.use_events):
+                self.values[f"poses.refine_{part}"] = False
+        kept = [part for part in parts if self._value(f"poses.refine_{part}") is not False]
+        found = clock_and_lens(recording, self._distance) if {"clock", "lens"} & {*kept} else None
+        clock, late, scale, words = 0.0, 0.0, 1.0, []
+        if found is not None:
+            delay, lens = found
+            if "clock" in kept and delay.is_told:
+                has_frames = recording.has_frames and not recording.reconstructed_by
+                frames = clock_of_frames(recording, 2 * (self._distance,)) if has_frames else None
+                if frames is not None and _is_wrong(frames, 0.0, SMALLEST_DELAY):
+                    late = frames.value
+                    words.append(f"frames are stamped {late:+.2f} ± {frames.error:.2f} ms late")
+                    if abs(delay.value - late) < 2.0 * delay.error:  # on one clock, which frames tell better
+                        delay = frames
+                if _is_wrong(delay, 0.0, SMALLEST_DELAY):
+                    clock = delay.value
+                    words.append(f"poses are stamped {clock:+.2f} ± {delay.error:.2f} ms late")
+            if "lens" in kept and _is_wrong(lens, 1.0, SMALLEST_SCALE):
+                scale = lens.value
+                words.append(f"the focal length is {scale:.3f} ± {lens.error:.3f} of the stated one")
+        clock = self.use("poses.clock_ms", lambda: clock)
+        late = self.use("poses.frame_delay_ms", lambda: late)
+        scale = self.use("poses.focal_scale", lambda: scale)
+        value = f"{', '.join(kept)}, where events show that they are wrong" if kept else "as they are stated"
+        why = f"sharpest events: {'; '.join(words)}" if words else "events are sharpest about as they are stated"
+        if found is None:
+            why = "too little is known before training" if kept else "set by flag"
+        if not refines or not self.use_events:
+            why = "not part of the method" if self.use_events else "learns from frames alone"
+        self.row("refined poses", bool(kept), value, why, "poses.refine_clock")
+        self._posed = Corrections(delay=clock, frame_delay=late, focal_scale=scale).recording(recording)
 
     def _events(self) -> None:
         """Which pairs are drawn."""
@@ -682,7 +775,7 @@ class _Resolver:
         name = f"{DATAPARSER}.depth_range"
         box = self.use(f"{DATAPARSER}.box", lambda: None)
         stated = self.use(name, lambda: None)
-        near, far = self._depth_range = scene_depth_range(recording, stated)
+        near, far = self._depth_range = scene_depth_range(self._posed, stated)
         if stated is None:
             self.values[name] = near, far
         _, self._scale, _ = scene_normalisation(recording, near, far, box)
@@ -799,6 +892,12 @@ class _Resolver:
             self.values |= {name: factor * self.values[name] for name in names}
             value = f"{factor} times the pairs and rays of the method"
             self.row("larger batch", True, value, "a step takes hardly longer with them", names[0])
+
+
+def _is_wrong(estimate: AgreementEstimate, stated: float, smallest: float) -> bool:
+    """Whether a value is told to differ from what is stated, and by more than the smallest that matters."""
+    apart = abs(estimate.value - stated)
+    return estimate.is_told and apart > max(smallest, 3.0 * estimate.error)
 
 
 def _path_extent(recording: EventRecording) -> float:

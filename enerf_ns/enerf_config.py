@@ -138,6 +138,7 @@ PAPER = MethodDefaults(
     no_event_loss_weight=5.0,  # 1 / C at the paper's C = 0.2: its weight of 1
     no_event_margin=1.0,
     level_loss_weight=0.0,
+    refines_poses=False,
     learns_sensor=False,
     whole_preset=True,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ from torch import Tensor
 from tyro.conf import Fixed, OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
+from enerf_ns.dataparsers.depth_range import scene_depth_range
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_data
 from enerf_ns.dataparsers.event_index import EventIndex
@@ -166,6 +168,12 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def recording(self) -> EventRecording:
         """The recording that is learnt from."""
         return self.train_dataset.recording
+
+    @property
+    def distance(self) -> float:
+        """Usual depth of the scene, metres."""
+        near, far = scene_depth_range(self.recording, self.config.dataparser.depth_range)
+        return math.sqrt(near * far)
 
     @property
     def held_out_spans(self) -> Int64[np.ndarray, "spans 2"]:

@@ -35,6 +35,7 @@ from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.poses.refiner import (
     FIRST_STEP,
     FROZEN_FROM,
+    LOOK_AGAIN_EVERY,
     LOOK_EVERY,
     LOOKS_A_SOLUTION,
     PAIRS,
@@ -246,7 +247,8 @@ class EnerfPipeline(VanillaPipeline):
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
         """Has the poses corrected, now and then, by what pairs of a training step tell."""
-        if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % LOOK_EVERY:
+        every = LOOK_AGAIN_EVERY if refiner.corrected else LOOK_EVERY
+        if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
         fired = batch.fired.stop
@@ -257,20 +259,27 @@ class EnerfPipeline(VanillaPipeline):
         times = manager.event_times(some, sensor)
         camera = manager.event_camera
         unit = float(sensor.mean_threshold)
-        logs, slopes = render_slopes(
-            model,
-            rays,
-            lambda rgb: sensor.log_brightness(rgb, some.pixels.repeat(2)) / unit,
-            camera.axes(times),
-            camera.scale,
-        )
+        with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training draws as without looks
+            logs, slopes = render_slopes(
+                model,
+                rays,
+                lambda rgb: sensor.log_brightness(rgb, some.pixels.repeat(2)) / unit,
+                camera.axes(times),
+                camera.scale,
+            )
         start, end = logs.chunk(2)
         with torch.no_grad():
-            residual = sensor.measured_change(some) / unit - (end - start)
+            change = end - start
+            residual = sensor.measured_change(some) / unit - change
+            others = torch.stack([change, (some.on + some.off).float(), 1e-9 * (some.end - some.start).float()], dim=1)
         refiner.look(
-            residual.double().cpu().numpy(), slopes, times.view(2, -1).cpu().numpy(), some.pixels.cpu().numpy()
+            residual.double().cpu().numpy(),
+            slopes,
+            times.view(2, -1).cpu().numpy(),
+            some.pixels.cpu().numpy(),
+            others.double().cpu().numpy(),
         )
-        if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve():
+        if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve(step):
             self._correct_poses()
 
     def _correct_poses(self) -> None:

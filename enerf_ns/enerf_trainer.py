@@ -45,7 +45,7 @@ from enerf_ns.dataparsers.errors import (
     printable,
     quoted,
 )
-from enerf_ns.dataparsers.files import absolute, write_together
+from enerf_ns.dataparsers.files import absolute, write_together, write_whole
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.recording import EventRecording
@@ -63,16 +63,20 @@ from enerf_ns.guarded_steps import (
     what_is_not_finite,
     why_nothing_is_learnt,
 )
+from enerf_ns.poses.findings import findings
 from enerf_ns.probe import view_direction_gain
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.ranges import check_ranges
-from enerf_ns.tables import choices_table, recording_table
+from enerf_ns.tables import choices_table, findings_table, recording_table
 from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
 from enerf_ns.threads import kernels_alone
 from enerf_ns.throughput import batch_factor
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
 """What Nerfstudio's proposal sampler remembers from step to step."""
+
+POSES_FILE = "poses.json"
+"""What was found to be wrong with clock, poses and lens, in the folder of a run."""
 
 LONG = 3600.0
 """Seconds of training beyond which it is said beforehand how long it takes."""
@@ -568,6 +572,7 @@ class EnerfTrainer(Trainer):
         if learned:
             numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
             say(f"The sensor as it was learned: {numbers}.")
+        self._say_poses()
         for what, where in {
             "checkpoint": quoted(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
@@ -576,6 +581,20 @@ class EnerfTrainer(Trainer):
             "look around": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)
+
+    def _say_poses(self) -> None:
+        """Shows what of clock, poses and lens was found to be wrong, and stores it with the run."""
+        refiner, manager = self.pipeline.poses, self.pipeline.datamanager
+        if refiner is None or not refiner.looks:
+            return
+        found = findings(refiner, manager.distance)
+        CONSOLE.print(findings_table(found))
+        try:
+            write_whole(self.base_dir / POSES_FILE, json.dumps([row.as_dict() for row in found], indent=2) + "\n")
+        except OSError as error:
+            say(f"{self.base_dir / POSES_FILE} could not be written ({error.strerror}); make room.")
+        if refiner.corrected:
+            say_where("poses as refined", f"enerf export poses {quoted(self.base_dir / 'config.yml')}")
 
     def _say_skipped(self) -> None:
         if self.num_skipped:

@@ -1,4 +1,4 @@
-"""What training prints at its start: what the recording holds, and what is made of it."""
+"""What training prints: what the recording holds, what is made of it, and what was found to be wrong with its poses."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.scene_box import scene_normalisation
+from enerf_ns.poses.findings import Finding
 
 
 def recording_table(parser: EventDataParserConfig) -> Table:
@@ -65,4 +66,19 @@ def choices_table(choices: Sequence[Choice]) -> Table:
         kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
         flag = Text(choice.flag.removeprefix(prefix), "dim")
         table.add_row(choice.part, kept, Text(choice.value), Text(choice.why), flag)
+    return table
+
+
+def findings_table(found: Sequence[Finding]) -> Table:
+    """What was found to be wrong with clock, poses and lens, and by how much that moves the picture."""
+    prefix = "--pipeline."
+    table = Table(title="Clock, poses and lens", caption=f"forced or forbidden by {prefix}FLAG True or False")
+    table.title_justify = table.caption_justify = "left"
+    for column in ("part", "", "found", "moves the picture by", "flag"):
+        table.add_column(column, overflow="fold")
+    for row in found:
+        kept = "[green]corrected[/green]" if row.is_corrected else "[dim]as stated[/dim]"
+        value = row.value if row.is_told else f"not told ({row.value})"
+        moved = f"{row.pixels:.2g} pixels" if row.is_corrected else ""
+        table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(prefix), "dim"))
     return table

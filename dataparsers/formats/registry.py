@@ -64,6 +64,7 @@ def read_recording(
     keep_hot_pixels: bool = False,
     keep_pose_gaps: bool = False,
     undistort: bool = True,
+    smooth_poses: bool = False,
     **options: object,
 ) -> EventRecording:
     """Reads a recording; its events are read when first asked for. A folder is read once per process.
@@ -72,7 +73,7 @@ def read_recording(
         path: Folder of the recording; never written to.
         format: Name of a registered format, or "auto" to find out.
         time_range: As of `EventRecording.selected`.
-        keep_hot_pixels, keep_pose_gaps, undistort: As of `EventRecording.selected`.
+        keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses: As of `EventRecording.selected`.
         options: Of the format, by name; those left out have its defaults.
 
     Raises:
@@ -80,7 +81,7 @@ def read_recording(
         FlagError: There is no such format, it lacks an option, or the range of time cannot be used.
     """
     found = _read_folder(absolute(path), format, **options)
-    return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort)
+    return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses)
 
 
 def layouts() -> tuple[str, ...]:

@@ -416,6 +416,12 @@ def encode_poses(
     return ("\n".join([header, *lines]) + "\n").encode()
 
 
+def encode_tum(trajectory: Trajectory) -> bytes:
+    """A trajectory as text of the TUM benchmark: t px py pz qx qy qz qw a line, seconds and metres."""
+    stamps = (f"{'-' * (time < 0)}{abs(time) // 10**9}.{abs(time) % 10**9:09d}" for time in trajectory.times.tolist())
+    return encode_poses("# t px py pz qx qy qz qw", stamps, trajectory.positions, trajectory.quaternions)
+
+
 def poses_at(
     trajectory: Trajectory, times: Int64[np.ndarray, " times"]
 ) -> tuple[Float64[np.ndarray, "times 3"], Float64[np.ndarray, "times 4"]]:

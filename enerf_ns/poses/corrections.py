@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -56,9 +56,11 @@ class DriftBasis:
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """By what clocks, poses and lens of a recording are wrong: the camera of the events has at time t the pose
-    T(t + delay) Exp(mount) Exp(drift(t)), where T is the given trajectory; in the axes of the camera, shift and rotation
-    apart, as `PosedCamera.rays` has corrections."""
+    """By what clocks, poses and lens of a recording are wrong.
+
+    The camera of the events has at time t the pose T(t + delay) Exp(mount) Exp(drift(t)), where T is the given
+    trajectory; in the axes of the camera, shift and rotation apart, as `PosedCamera.rays` has corrections.
+    """
 
     delay: float = 0.0
     """Milliseconds by which the given poses are stamped later than events of the same instant."""
@@ -75,6 +77,7 @@ class Corrections:
     basis: DriftBasis | None = None
     drift: Float64[np.ndarray, "functions 6"] | None = None
     """Coefficients of the drift, of shifts in metres and of rotation vectors in radians. None: there is none."""
+    _made: tuple[Trajectory, Trajectory] | None = field(default=None, init=False, repr=False)
 
     @property
     def moves_poses(self) -> bool:
@@ -120,34 +123,41 @@ class Corrections:
         return poses
 
     def trajectory(self, given: Trajectory) -> Trajectory:
-        """The trajectory of the camera of the events, from the same first to the same last time."""
+        """The trajectory of the camera of the events, from the same first to the same last time; of one that is given,
+        always the same object."""
         if not self.moves_poses:
             return given
-        times = _inner_times(given, self.delay)
-        return _trajectory(times, self.poses(given, times))
+        if self._made is None or self._made[0] is not given:
+            times = _inner_times(given, self.delay)
+            object.__setattr__(self, "_made", (given, _trajectory(times, self.poses(given, times))))
+        assert self._made is not None
+        return self._made[1]
 
     def frames(self, given: Frames, recording: EventRecording) -> Frames:
-        """Frames of a recording with the poses of their camera. Their stamps stay: what their clock is wrong by is taken
-        into the trajectory. A camera of their own keeps its lens, and its pose against the camera of the events."""
-        camera = self.camera(given.camera) if given.camera == recording.camera else given.camera
-        if not self.moves_poses and not self.frame_delay:
-            return given if camera is given.camera else replace(given, camera=camera)
+        """Frames of a recording on the clock of its events, with the poses of their camera.
+
+        A camera of their own keeps its lens, and its pose against the camera of the events.
+
+        Args:
+            given: Within the poses.
+            recording: As it was read.
+        """
         of_events, of_frames = recording.trajectory, given.trajectory
-        if of_frames is of_events and not self.frame_delay:
-            return replace(given, camera=camera, trajectory=self.trajectory(of_events))
-        frame_shift = -round(MILLISECOND * self.frame_delay)
-        times = _inner_times(of_frames, self.delay - self.frame_delay)
-        poses = self.poses(of_events, times + frame_shift)
-        if of_frames is not of_events:
-            stamped = times + frame_shift + round(MILLISECOND * self.delay)
-            before, own = poses_at(of_events, stamped), poses_at(of_frames, stamped)
-            back = before[:, :, :3].transpose(0, 2, 1)
-            mount = back @ np.concatenate([own[:, :, :3], own[:, :, 3:] - before[:, :, 3:]], axis=2)
-            rotation = poses[:, :, :3]
-            moved = rotation @ mount
-            moved[:, :, 3] += poses[:, :, 3]
-            poses = moved
-        return replace(given, camera=camera, trajectory=_trajectory(times, poses))
+        camera = self.camera(given.camera) if given.camera == recording.camera else given.camera
+        times = given.times - round(MILLISECOND * self.frame_delay)
+        found = replace(given, camera=camera, times=times.clip(of_frames.start, of_frames.end))
+        if not self.moves_poses:
+            return found
+        if of_frames is of_events:
+            return replace(found, trajectory=self.trajectory(of_events))
+        knots = _inner_times(of_frames, self.delay)
+        stamped, poses = knots + round(MILLISECOND * self.delay), self.poses(of_events, knots)
+        before, own = poses_at(of_events, stamped), poses_at(of_frames, stamped)
+        back = before[:, :, :3].transpose(0, 2, 1)
+        mount = back @ np.concatenate([own[:, :, :3], own[:, :, 3:] - before[:, :, 3:]], axis=2)
+        moved = poses[:, :, :3] @ mount
+        moved[:, :, 3] += poses[:, :, 3]
+        return replace(found, trajectory=_trajectory(knots, moved))
 
     def recording(self, given: EventRecording) -> EventRecording:
         """A recording with the camera and the poses that it should have had; events and frames are the same files."""
@@ -167,8 +177,10 @@ class Corrections:
 
 
 def poses_at(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
-    """Camera-to-world matrices [R | t] at any times (ns): before the first pose, and after the last one, the camera goes
-    on at the speed, and turns at the rate, that it has between the last two."""
+    """Camera-to-world matrices [R | t] at any times (ns).
+
+    Before the first pose, and after the last one, the camera goes on as between the last two.
+    """
     inside = times.clip(trajectory.start, trajectory.end)
     poses = trajectory.poses(torch.from_numpy(inside)).numpy()
     ends = (trajectory.times[:2], times < trajectory.start), (trajectory.times[:-3:-1], times > trajectory.end)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal, Optional
 
 import numpy as np
@@ -22,14 +23,13 @@ from enerf_ns.poses.corrections import Corrections, DriftBasis
 if TYPE_CHECKING:
     from enerf_ns.enerf_model import EnerfModel
 
-Part = Literal["clock", "rotation", "translation", "focal_length", "distortion", "drift"]
+Part = Literal["clock", "rotation", "translation", "lens", "drift"]
 
 UNITS: dict[Part, float] = {
     "clock": 20.0,
     "rotation": math.radians(1.0),
     "translation": 0.01,
-    "focal_length": 0.03,
-    "distortion": 0.05,
+    "lens": 0.03,
     "drift": 1.0,
 }
 """How large each number may be expected to be: its unit here, and the standard deviation of what is known of it
@@ -47,8 +47,9 @@ FIRST_STEP = 50
 FROZEN_FROM = 0.8
 """Share of the steps after which corrections stay as they are."""
 
-LOOK_EVERY, LOOKS_A_SOLUTION = 4, 6
-"""Steps from which pairs are looked at to the next, and how often that is done before corrections are."""
+LOOK_EVERY, LOOK_AGAIN_EVERY, LOOKS_A_SOLUTION = 4, 2, 6
+"""Steps from which pairs are looked at to the next, the same where something is being corrected, and how often that is
+done before what was seen is solved."""
 
 PAIRS = 256
 """Most pairs that are looked at at once."""
@@ -56,9 +57,18 @@ PAIRS = 256
 MEMORY = 0.9
 """Share of what was seen before that counts after poses were corrected."""
 
-SURE = 9.0
+SURE, STAYS = 9.0, 3.0
 """By how much the squared error, in units of its variance, must fall beyond what chance explains before something is
-corrected."""
+corrected, and for it to stay so."""
+
+SYSTEMATIC = float(__import__("os").environ.get("SYS", 0.01))
+"""Pixels by which what is rendered may be off as a whole in any one way, however much was seen: standard deviation."""
+
+SETTLED_AFTER = 200.0
+"""Steps before which it may be off by more, the more the fewer they are."""
+
+TOLD = 0.25
+"""Largest standard error of numbers that are said to be told, in their units."""
 
 LARGEST_STEP = 0.5
 """Most that any number changes at once, in its unit."""
@@ -67,8 +77,7 @@ LIMITS: dict[Part, float] = {
     "clock": 5.0,
     "rotation": 10.0,
     "translation": 20.0,
-    "focal_length": 8.0,
-    "distortion": 8.0,
+    "lens": 8.0,
     "drift": 20.0,
 }
 """Largest corrections, in their units, that are believed."""
@@ -76,8 +85,12 @@ LIMITS: dict[Part, float] = {
 MIDDLE_GREY = 0.3
 """Brightness of what is not stopped by surfaces."""
 
-NUM_SHAPES = 10
+POWERS = [(i, j, k) for i in range(3) for j in range(3) for k in range(3) if i + j + k <= 2]
+NUM_SHAPES = len(POWERS)
 """Number of polynomials of the place, up to squares, along each axis, by which the scene may bend."""
+
+NUM_OTHERS = 3
+"""Number of columns of what else may be wrong: contrast, the thresholds' ratio, a leak."""
 
 BEND = 0.1
 """How far the scene may be expected to bend, scene units."""
@@ -90,6 +103,12 @@ class RefinerConfig:
     clock_ms: Optional[float] = None  # noqa: UP045
     """Milliseconds by which poses are stamped later than events of the same instant. None: what the contrast of the
     events tells, refined while training; a value is kept."""
+    frame_delay_ms: Optional[float] = None  # noqa: UP045
+    """Milliseconds by which frames are stamped later than events of the same instant. None: where poses are, what edges
+    in frames tell before training; else 0."""
+    focal_scale: Optional[float] = None  # noqa: UP045
+    """The focal length as a multiple of the stated one. None: what the contrast of the events tells, refined while
+    training; a value is kept."""
     refine_clock: Optional[bool] = None  # noqa: UP045
     """Correct the clock between poses and events. None: where the events show that it is wrong."""
     refine_mount: Optional[bool] = None  # noqa: UP045
@@ -131,39 +150,41 @@ class PoseRefiner(nn.Module):
         pieces = round(1e-9 * (trajectory.end - trajectory.start) / PIECE_SECONDS)
         pieces = min(max(pieces, FEWEST_PIECES), MOST_PIECES)
         self.basis = DriftBasis(trajectory.start, trajectory.end, pieces)
-        sizes: dict[Part, int] = {"clock": 1, "rotation": 3, "translation": 3, "focal_length": 1, "distortion": 1}
+        has_coefficients = recording.camera.model != "lookup"
+        sizes: dict[Part, int] = {"clock": 1, "rotation": 3, "translation": 3, "lens": 1 + has_coefficients}
         sizes["drift"] = 6 * self.basis.size
-        if recording.camera.model == "lookup":
-            del sizes["distortion"]
         ends = np.cumsum([*sizes.values()])
         self.parts = {part: slice(end - size, end) for (part, size), end in zip(sizes.items(), ends, strict=True)}
         self.number = int(ends[-1])
-        whole = self.number + 3 * NUM_SHAPES
+        whole = self.number + 3 * NUM_SHAPES + NUM_OTHERS
         self.register_buffer("value", torch.zeros(self.number, dtype=torch.float64))
         self.register_buffer("errors", torch.zeros(self.number, dtype=torch.float64))
         self.register_buffer("is_corrected", torch.zeros(len(self.parts), dtype=torch.bool))
         self.register_buffer("normal", torch.zeros(whole, whole, dtype=torch.float64))
         self.register_buffer("right", torch.zeros(whole, dtype=torch.float64))
         self.register_buffer("looks", torch.zeros((), dtype=torch.int64))
-        self._lens_cache: dict[tuple[str, float, float], np.ndarray] = {}
+        self._lens: tuple[tuple[float, float], list[np.ndarray]] | None = None
         self._before = np.eye(whole)
         drift = self.parts["drift"]
         self._before[drift, drift] += np.kron(self.basis.roughness, np.eye(6))
         self._units = np.concatenate([np.full(size, UNITS[part]) for part, size in sizes.items()])
         self._units[drift] = np.tile(DRIFT_UNITS, self.basis.size)
-        if config.clock_ms:
-            self.value[self.parts["clock"]] = config.clock_ms / UNITS["clock"]
         wanted: dict[Part, bool | None] = {
             "clock": config.refine_clock,
             "rotation": config.refine_mount,
             "translation": config.refine_mount,
-            "focal_length": config.refine_lens,
-            "distortion": config.refine_lens,
+            "lens": config.refine_lens,
             "drift": config.refine_drift,
         }
+        self.wanted = [part for part in self.parts if wanted[part] is True]
         self.allowed = [part for part in self.parts if wanted[part] is not False]
         for number, part in enumerate(self.parts):
             self.is_corrected[number] = wanted[part] is True
+        starts: dict[Part, float] = {"clock": config.clock_ms or 0.0, "lens": (config.focal_scale or 1.0) - 1.0}
+        for part, start in starts.items():
+            if start:
+                self.value[self.parts[part].start] = start / UNITS[part]
+                self.is_corrected[list(self.parts).index(part)] = True
 
     @property
     def corrected(self) -> list[Part]:
@@ -180,10 +201,11 @@ class PoseRefiner(nn.Module):
         drifts = "drift" in self.corrected
         return Corrections(
             delay=float(numbers["clock"][0]),
+            frame_delay=self.config.frame_delay_ms or 0.0,
             rotation=tuple(numbers["rotation"].tolist()),
             translation=tuple(numbers["translation"].tolist()),
-            focal_scale=1.0 + float(numbers["focal_length"][0]),
-            distortion=float(numbers["distortion"][0]) if "distortion" in numbers else 0.0,
+            focal_scale=1.0 + float(numbers["lens"][0]),
+            distortion=float(numbers["lens"][1:].sum()),
             basis=self.basis if drifts else None,
             drift=numbers["drift"].reshape(-1, 6) if drifts else None,
         )
@@ -194,6 +216,7 @@ class PoseRefiner(nn.Module):
         slopes: Slopes,
         times: Int64[np.ndarray, "2 pairs"],
         pixels: Int64[np.ndarray, " pairs"],
+        others: Float64[np.ndarray, "pairs others"],
     ) -> None:
         """Takes in some pairs.
 
@@ -202,6 +225,8 @@ class PoseRefiner(nn.Module):
             slopes: Of the rendered log brightness, thresholds, of all first instants and then of all second ones.
             times: Of both instants, ns.
             pixels: Their numbers, y * width + x.
+            others: By how much the change of log brightness, thresholds, changes with what else may be wrong, each
+                about 1.
         """
         times = times.reshape(-1)
         twists = np.concatenate([slopes.shifts, slopes.turns], axis=1)
@@ -209,7 +234,7 @@ class PoseRefiner(nn.Module):
         each = np.concatenate(columns, axis=1)
         each[:, : self.number] *= self._units
         each[:, self.number :] *= BEND
-        changes = each[len(residual) :] - each[: len(residual)]
+        changes = np.concatenate([each[len(residual) :] - each[: len(residual)], others], axis=1)
         weight = 1.0 / np.maximum(np.abs(residual), 1.0)
         variance = max(float((weight * residual**2).sum() / weight.sum()), 1e-6)
         weighted = changes * (weight / variance)[:, None]
@@ -236,82 +261,115 @@ class PoseRefiner(nn.Module):
             "clock": (twists * a_millisecond).sum(axis=1, keepdims=True),
             "rotation": twists[:, 3:],
             "translation": twists[:, :3],
-            "focal_length": (slopes.directions * self._lens_slopes("focal_scale")[pixels]).sum(axis=1, keepdims=True),
+            "lens": np.stack(
+                [(slopes.directions * slope[pixels]).sum(axis=1) for slope in self._lens_slopes()], axis=1
+            ),
         }
-        if "distortion" in self.parts:
-            by_lens = self._lens_slopes("distortion")[pixels]
-            columns["distortion"] = (slopes.directions * by_lens).sum(axis=1, keepdims=True)
         return columns | {"drift": drift.reshape(len(times), -1)}
 
-    def _lens_slopes(self, name: str) -> Float64[np.ndarray, "pixels 3"]:
-        """By how much the directions of pixels change with a number of the lens."""
+    def _lens_slopes(self) -> list[Float64[np.ndarray, "pixels 3"]]:
+        """By how much the directions of pixels change with each number of the lens."""
         now, step = self.corrections, 1e-3
-        key = name, now.focal_scale, now.distortion
-        if key not in self._lens_cache:
-            self._lens_cache = {old: value for old, value in self._lens_cache.items() if old[0] != name}
-            directions = []
-            for sign in (-1, 1):
-                lens = Corrections(focal_scale=now.focal_scale, distortion=now.distortion)
-                lens = replace(lens, **{name: getattr(lens, name) + sign * step})
-                rays = lens.camera(self.recording.camera).pixel_directions().reshape(-1, 3)
-                directions.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-            self._lens_cache[key] = (directions[1] - directions[0]) / (2.0 * step)
-        return self._lens_cache[key]
+        key = now.focal_scale, now.distortion
+        if self._lens is None or self._lens[0] != key:
+            slopes = []
+            for name in ("focal_scale", "distortion")[: self.parts["lens"].stop - self.parts["lens"].start]:
+                ends = []
+                for sign in (-1, 1):
+                    lens = Corrections(focal_scale=now.focal_scale, distortion=now.distortion)
+                    lens = replace(lens, **{name: getattr(lens, name) + sign * step})
+                    rays = lens.camera(self.recording.camera).pixel_directions().reshape(-1, 3)
+                    ends.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+                slopes.append((ends[1] - ends[0]) / (2.0 * step))
+            self._lens = key, slopes
+        return self._lens[1]
 
-    def solve(self) -> bool:
+    def solve(self, step: int) -> bool:
         """Corrects what was seen to be wrong.
 
+        Args:
+            step: Of the training.
+
         Returns:
-            Whether anything was.
+            Whether anything changed.
 
         Raises:
             RecordingError: Something is wrong by more than can be.
         """
-        bends = np.arange(self.number, len(self.right))
-        normal, right = self.normal.numpy(), self.right.numpy()
-        corrected = self.corrected
-        gains = self._gains(normal, right, corrected, bends)
-        found = [part for part, gain in gains.items() if gain > 0]
-        if found:
-            best = max(found, key=lambda part: gains[part])
-            self.is_corrected[list(self.parts).index(best)] = True
-            corrected = self.corrected
-        if not corrected:
+        systematic = SYSTEMATIC * max(1.0, SETTLED_AFTER / step)
+        believed = 1.0 / (1.0 + systematic**2 * self._information_a_pixel)
+        normal, right = believed * self.normal.numpy(), believed * self.right.numpy()
+        value = np.zeros(len(right))
+        for part in self.allowed:
+            value[self.parts[part]] = self.value.numpy()[self.parts[part]]
+        parts = self._best_parts(normal, right + normal @ value)
+        if not parts and not self.corrected:
             return False
-        own = np.concatenate([np.arange(self.number)[self.parts[part]] for part in corrected])
-        free = np.concatenate([own, bends])
-        some = np.ix_(free, free)
-        damped, value = normal[some] + self._before[some], np.zeros(len(free))
-        value[: len(own)] = self.value.numpy()[own]
-        pull = right[free] - self._before[some] @ value
-        step = np.linalg.solve(damped, pull)
-        step *= min(1.0, LARGEST_STEP / max(float(np.abs(step[: len(own)]).max()), 1e-12))
+        for number, part in enumerate(self.parts):
+            if part in self.allowed:
+                self.is_corrected[number] = part in parts
+        free, own = self._numbers(parts), len(self._numbers(parts)) - (len(right) - self.number)
+        damped = normal[np.ix_(free, free)] + self._before[np.ix_(free, free)]
+        best = np.zeros(len(right))
+        best[free] = np.linalg.solve(damped, (right + normal @ value)[free])
+        change = best - value
+        change *= min(1.0, LARGEST_STEP / max(float(np.abs(change[: self.number]).max()), 1e-12))
         self.errors.zero_()
-        self.errors[own] = torch.from_numpy(np.sqrt(np.linalg.inv(damped).diagonal()[: len(own)]))
-        self.value[own] += torch.from_numpy(step[: len(own)])
-        whole = np.zeros(len(right))
-        whole[free] = step
-        self.right.copy_(torch.from_numpy(MEMORY * (right - normal @ whole)))
+        self.errors[free[:own]] = torch.from_numpy(np.sqrt(np.linalg.inv(damped).diagonal()[:own]))
+        self.value += torch.from_numpy(change[: self.number])
+        self.right.copy_(torch.from_numpy(MEMORY * (right - normal @ change) / believed))
         self.normal *= MEMORY
         self._check()
         return True
 
-    def _gains(self, normal, right, corrected: list[Part], bends: np.ndarray) -> dict[Part, float]:
-        """By how much more than chance explains correcting each part would lower the squared error (score test)."""
-        base = [np.arange(self.number)[self.parts[part]] for part in corrected] + [bends]
+    def errors_of(self, part: Part) -> Float64[np.ndarray, " numbers"]:
+        """Standard errors of the numbers of a part, in milliseconds, radians, metres or shares, whether it is corrected
+        or not; those of the drift are of its coefficients."""
+        believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_pixel)
+        parts = [other for other in self.parts if other == part or other in self.corrected]
+        numbers = self._numbers(parts)
+        some = np.ix_(numbers, numbers)
+        variances = np.zeros(len(self.right))
+        variances[numbers] = np.linalg.inv(believed * self.normal.numpy()[some] + self._before[some]).diagonal()
+        return (np.sqrt(variances[: self.number]) * self._units)[self.parts[part]]
 
-        def explained(numbers: list[np.ndarray]) -> float:
-            free = np.concatenate(numbers)
-            damped = normal[np.ix_(free, free)] + 1e-3 * self._before[np.ix_(free, free)]
-            return float(right[free] @ np.linalg.solve(damped, right[free]))
+    def _numbers(self, parts: Sequence[Part]) -> Int64[np.ndarray, " free"]:
+        """Places of the numbers of some parts in a solution, and of all that is solved for beside them."""
+        whole = np.arange(len(self.right))
+        return np.concatenate([*(whole[self.parts[part]] for part in parts), whole[self.number :]])
 
-        before, found = explained(base), {}
-        for part in self.allowed:
-            if part not in corrected:
-                numbers = np.arange(self.number)[self.parts[part]]
-                chance = len(numbers) + 3.0 * math.sqrt(2.0 * len(numbers)) + SURE
-                found[part] = explained([*base, numbers]) - before - chance
-        return found
+    def _best_parts(
+        self, normal: Float64[np.ndarray, "whole whole"], right: Float64[np.ndarray, " whole"]
+    ) -> tuple[Part, ...]:
+        """Of all sets of parts that may be corrected, the one that explains most of the squared error beyond chance.
+
+        Args:
+            normal, right: Of the equations for all numbers, not for their changes.
+        """
+        best, most, beside = (), -math.inf, len(right) - self.number
+        free = [part for part in self.allowed if part not in self.wanted]
+        for count in range(len(free) + 1):
+            for others in combinations(free, count):
+                parts = tuple(part for part in self.parts if part in self.wanted or part in others)
+                numbers = self._numbers(parts)
+                damped = normal[np.ix_(numbers, numbers)] + self._before[np.ix_(numbers, numbers)]
+                covariance = np.linalg.inv(damped)
+                worth = float(right[numbers] @ covariance @ right[numbers])
+                errors = np.full(self.number, 0.0)
+                errors[numbers[:-beside]] = np.sqrt(covariance.diagonal()[:-beside])
+                for part in others:
+                    size = self.parts[part].stop - self.parts[part].start
+                    worth -= size + 3.0 * math.sqrt(2.0 * size) + (STAYS if part in self.corrected else SURE)
+                told = all(part == "drift" or errors[self.parts[part]].max() < TOLD for part in others)
+                if told and worth > most:
+                    best, most = parts, worth
+        return best
+
+    @property
+    def _information_a_pixel(self) -> float:
+        """By how much the squared error, in units of its variance, rises when all that is rendered moves by a pixel."""
+        sideways = self.normal.diagonal()[self.parts["rotation"]][:2].mean()
+        return float(sideways) / (UNITS["rotation"] * self.recording.camera.fx) ** 2
 
     def _check(self) -> None:
         for part, where in self.parts.items():
@@ -380,8 +438,7 @@ def render_slopes(
         for parameter in learned:
             parameter.requires_grad_(True)
     places = (origins + frustums.directions * middles).detach()
-    x, y, z = places.unbind(-1)
-    shapes = torch.stack([torch.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], dim=-1)
+    shapes = torch.stack([(places ** places.new_tensor(powers)).prod(dim=-1) for powers in POWERS], dim=-1)
     bends = torch.einsum("rsk,rsa->rka", shapes, slopes).flatten(1)
     back = axes.transpose(1, 2)
     local = (back @ rays.directions[..., None])[..., 0]

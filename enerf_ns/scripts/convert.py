@@ -10,7 +10,7 @@ import tyro
 
 from enerf_ns.dataparsers.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.files import absolute, expanded
-from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording
+from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
 from enerf_ns.scripts.format_options import format_flags
 
 
@@ -23,6 +23,9 @@ class Convert:
     output_dir: Path
     """New folder for the recording."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
+    run: Path | None = None
+    """Run that was trained on the recording, or its config.yml: the new recording has the poses, clocks and lens that
+    it refined."""
     poses: Path | None = None
     """For an event file: lines t px py pz qx qy qz qw, on the clock of the file; camera to world, OpenCV axes."""
     poses_unit: Literal["s", "us", "ns"] = "s"
@@ -39,13 +42,34 @@ class Convert:
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"
                 raise FlagError(f"{flag} is for folders of recordings, but {source} is a file; leave it out.")
+            if self.run is not None:
+                raise FlagError(f"--run is for folders of recordings, but {source} is a file; leave it out.")
             poses, camera = (path and expanded(path) for path in (self.poses, self.camera))
             sentences = convert_event_file(source, output_dir, poses, self.poses_unit, camera)
         else:
             for flag, value in (("--poses", self.poses), ("--camera", self.camera)):
                 if value is not None:
                     raise FlagError(f"{flag} is for event files, but {source} is a folder with its own; leave it out.")
-            sentences = convert_recording(source, output_dir, **chosen)
+            if self.run is None:
+                sentences = convert_recording(source, output_dir, **chosen)
+            else:
+                sentences = self._convert_refined(self.run, source, output_dir)
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
+
+    def _convert_refined(self, run: Path, source: Path, output_dir: Path) -> list[str]:
+        """Writes the recording with the poses that a run refined."""
+        from enerf_ns.evaluation.runs import load  # here, since PyTorch and Nerfstudio take seconds
+        from enerf_ns.report.run_files import read_run
+
+        files = read_run(run)
+        if not files.stored:
+            raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
+        refined = load(files.config_file).pipeline.datamanager.recording
+        if refined.path != source:
+            raise FlagError(
+                f"--run {run} was trained on {refined.path}, not on {source}; give a run of this recording."
+            )
+        with new_folder(source, output_dir) as folder:
+            return write_recording(refined, folder)

@@ -1,11 +1,11 @@
-"""`enerf export`: meshes and point clouds of trained runs, in metres and in the axes of the recording."""
+"""`enerf export`: meshes, points and refined poses of trained runs, in metres and in the axes of the recording."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Optional  # tyro reads these annotations on Python 3.10
+from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads these annotations on Python 3.10
 
 import numpy as np
 import tyro
@@ -14,7 +14,11 @@ from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError, 
 from enerf_ns.dataparsers.files import absolute, expanded, write_together
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 
+if TYPE_CHECKING:
+    from enerf_ns.enerf_pipeline import EnerfPipeline
+
 SUFFIXES = (".ply", ".glb")
+POSE_SUFFIXES = (".txt",)
 
 VOXEL_PIXELS = 1.5
 """Side of a voxel, in pixels on the median of what is known."""
@@ -22,18 +26,21 @@ VOXEL_PIXELS = 1.5
 
 @dataclass
 class Export:
-    """Make a mesh or a point cloud of what a run knows, in metres and in the axes of the recording.
+    """Make a mesh or a point cloud of what a run knows, or write its poses, in metres and in the axes of the recording.
 
-    What no camera saw, or no event told of, stays empty. Where the recording was simulated, or a reference is given, it
-    is scored, and the scores are written beside it.
+    What no camera saw, or no event told of, stays empty. Where the recording was simulated, or a reference is given,
+    it is scored, and the scores are written beside it.
+
+    Poses are those of the camera of the events, as training refined them: a line t px py pz qx qy qz qw each (TUM), on
+    the clock of the events, camera to world, OpenCV axes. The lens is written beside them.
     """
 
-    what: Annotated[Literal["mesh", "pointcloud"], tyro.conf.Positional]
-    """A mesh, or points."""
+    what: Annotated[Literal["mesh", "pointcloud", "poses"], tyro.conf.Positional]
+    """A mesh, points, or poses."""
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run, or its config.yml."""
     output: Optional[Path] = None  # noqa: UP045
-    """File to be written, .ply or .glb (glTF). None: mesh.ply or pointcloud.ply in the folder of the run."""
+    """File to be written: .ply or .glb (glTF), of poses .txt. None: in the folder of the run."""
     voxel: Optional[float] = None  # noqa: UP045
     """Side of a voxel within which depth is averaged, in metres. None: 1.5 pixels on the median of what is known."""
     reference: Optional[Path] = None  # noqa: UP045
@@ -49,14 +56,21 @@ class Export:
         if self.voxel is not None and not 0.0 < self.voxel < np.inf:
             raise FlagError(f"--voxel is {self.voxel:g}, but must be metres above 0.")
         files = read_run(self.run)
-        output = absolute(self.output or files.config_file.parent / f"{self.what}.ply")
-        if output.suffix not in SUFFIXES:
-            raise FlagError(f"--output {output} ends with neither .ply nor .glb; give a file that does.")
+        suffixes = POSE_SUFFIXES if self.what == "poses" else SUFFIXES
+        output = absolute(self.output or files.config_file.parent / f"{self.what}{suffixes[0]}")
+        if output.suffix not in suffixes:
+            raise FlagError(f"--output {output} does not end with {' or '.join(suffixes)}; give a file that does.")
         if output.is_dir():
             raise OutputError(f"--output {output} is a folder; give the name of a file.")
         check_outside_recordings("--output", output, files.config.data, self.reference)
         if not files.stored:
             raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
+        if self.what == "poses":
+            for flag, value in (("--voxel", self.voxel), ("--reference", self.reference)):
+                if value is not None:
+                    raise FlagError(f"{flag} is for meshes and points; leave it out.")
+            self._write_poses(load(files.config_file).pipeline, output)
+            return
         notes: list[str] = []
         scene = load_scene(expanded(self.reference), np.random.default_rng(0), notes) if self.reference else None
 
@@ -88,3 +102,25 @@ class Export:
             raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
         for line in [*(f"note: {note}" for note in notes), *lines]:
             print(printable(line))
+
+    def _write_poses(self, pipeline: EnerfPipeline, output: Path) -> None:
+        from enerf_ns.dataparsers.formats.writer import camera_json, encode_tum
+        from enerf_ns.poses.findings import findings
+
+        recording, refiner = pipeline.datamanager.recording, pipeline.poses
+        found = [] if refiner is None else findings(refiner, pipeline.datamanager.distance)
+        camera = {**camera_json(recording.camera), "corrections": [row.as_dict() for row in found]}
+        try:
+            write_together(
+                output.parent,
+                {
+                    output.name: encode_tum(recording.trajectory),
+                    f"{output.stem}.json": (json.dumps(camera, indent=2) + "\n").encode(),
+                },
+            )
+        except OSError as error:
+            raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
+        corrected = [f"{row.what}: {row.value}" for row in found if row.is_corrected]
+        for line in corrected or ["Nothing of the poses was found to be wrong; they are those of the recording."]:
+            print(printable(line))
+        print(printable(f"{len(recording.trajectory.times):,} poses: {output}"))

@@ -1,0 +1,113 @@
+"""What was found to be wrong with clock, poses and lens of a recording, in words, with how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.trajectory import evenly_spaced
+from enerf_ns.poses.corrections import Corrections
+from enerf_ns.poses.refiner import TOLD, UNITS, Part, PoseRefiner
+
+INSTANTS, PLACES = 64, 5
+"""Instants of a recording, and columns and rows of pixels, whose points are followed from poses to others."""
+
+FLAGS: dict[Part, str] = {
+    "clock": "--pipeline.refine-clock",
+    "rotation": "--pipeline.refine-mount",
+    "translation": "--pipeline.refine-mount",
+    "lens": "--pipeline.refine-lens",
+    "drift": "--pipeline.refine-drift",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number, or some that belong together."""
+
+    what: str
+    value: str
+    """With its unit and its standard error."""
+    is_corrected: bool
+    is_told: bool
+    """Whether the recording tells it; what it does not tell stays as it was stated."""
+    pixels: float
+    """By how much the correction moves the picture, root mean square over pixels and time."""
+    flag: str
+    """Flag of `ns-train` by which it is forced, or forbidden."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
+    """What a training found, a row for each thing that may be wrong.
+
+    Args:
+        refiner: At the end of the training, or while it goes on.
+        distance: Usual depth of the scene, metres.
+    """
+    now, recording = refiner.corrections, refiner.recording
+    errors = {part: refiner.errors_of(part) for part in refiner.parts}
+    turn, turn_error = (np.degrees(np.linalg.norm(both)) for both in (now.rotation, errors["rotation"]))
+    shift, shift_error = (1e3 * np.linalg.norm(both) for both in (now.translation, errors["translation"]))
+    focal_error, *distortion_error = errors["lens"]
+    lens = f"focal length {now.focal_scale:.4f} ± {focal_error:.4f} of the stated one"
+    if distortion_error:
+        lens += f", first coefficient of distortion {now.distortion:+.4f} ± {distortion_error[0]:.4f}"
+    drift = "none"
+    if now.basis is not None and now.drift is not None:
+        values = now.basis.at(evenly_spaced(now.basis.start, now.basis.end, 256)) @ now.drift
+        far, wide = (np.sqrt((values[:, some] ** 2).sum(axis=1).mean()) for some in (slice(3), slice(3, 6)))
+        drift = f"{1e3 * far:.2g} mm and {np.degrees(wide):.2g} degrees, root mean square"
+    one_by_one = {
+        "clock": (
+            "clock of the poses",
+            f"{now.delay:+.2f} ± {errors['clock'][0]:.2f} ms late",
+            replace(now, delay=0.0),
+        ),
+        "rotation": (
+            "mount, rotation",
+            f"{turn:.2f} ± {turn_error:.2f} degrees",
+            replace(now, rotation=(0.0, 0.0, 0.0)),
+        ),
+        "translation": (
+            "mount, shift",
+            f"{shift:.1f} ± {shift_error:.1f} mm",
+            replace(now, translation=(0.0, 0.0, 0.0)),
+        ),
+        "lens": ("lens", lens, replace(now, focal_scale=1.0, distortion=0.0)),
+        "drift": ("drift", drift, replace(now, drift=None)),
+    }
+    found = []
+    for part, (what, value, without) in one_by_one.items():
+        units = UNITS[part] if part != "drift" else np.inf
+        told = bool((errors[part] < TOLD * units).all())
+        moved = picture_shift(recording, without, now, distance)
+        found.append(Finding(what, value, part in refiner.corrected, told, moved, FLAGS[part]))
+    return found
+
+
+def picture_shift(recording: EventRecording, first: Corrections, second: Corrections, distance: float) -> float:
+    """By how many pixels points move in the picture from some corrections to others, root mean square.
+
+    Args:
+        recording: As it was read.
+        first, second: The corrections.
+        distance: Depth of the points, metres.
+    """
+    times = recording.instants(INSTANTS)
+    before, after = (corrections.poses(recording.trajectory, times) for corrections in (first, second))
+    camera, other = (corrections.camera(recording.camera) for corrections in (first, second))
+    rows, columns = (np.linspace(0, side - 1, PLACES).round().astype(int) for side in (camera.height, camera.width))
+    places = np.ix_(rows, columns)
+    seen, now = (lens.pixel_directions()[places].reshape(-1, 3) for lens in (camera, other))
+    world = before[:, None, :, 3] + distance * seen @ before[:, :, :3].transpose(0, 2, 1)
+    there = (world - after[:, None, :, 3]) @ after[:, :, :3]
+    apart: Float64[np.ndarray, "times places 2"] = there[..., :2] / there[..., 2:].clip(min=1e-9) - now[:, :2]
+    return float(np.sqrt((([camera.fx, camera.fy] * apart) ** 2).sum(axis=-1).mean()))
