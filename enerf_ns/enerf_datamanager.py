@@ -132,6 +132,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     """Draws what the sensor saw, and makes rays of it. What it needs for either is made when first asked for."""
 
     config: EnerfDataManagerConfig
+    corrections = Corrections()
+    """What is corrected of the recording by now."""
     train_dataset: EventDataset
     eval_dataset: EventDataset
 
@@ -357,6 +359,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def correct(self, corrections: Corrections) -> None:
         """Has rays follow corrected poses, and through a corrected lens, and the cameras of frames too."""
+        self.corrections = corrections
         for dataset in (self.train_dataset, self.eval_dataset):
             dataset.correct(corrections)
         for name in ("event_camera", "event_camera_without_distortion", "frame_camera"):

@@ -28,11 +28,12 @@ from enerf_ns.enerf_datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.enerf_model import EnerfModel, EnerfModelConfig
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
 from enerf_ns.evaluation.protocols import described
-from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.scores import scores_at_stated_poses, summary_scores
 from enerf_ns.evaluation.views import aligned_views, held_out_views, save_pictures
 from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.poses.refiner import (
+    BEGINS_UNTIL,
     FIRST_STEP,
     FROZEN_FROM,
     LOOK_AGAIN_EVERY,
@@ -139,7 +140,6 @@ class EnerfPipeline(VanillaPipeline):
         """Is told where each part of a step ends."""
         self.num_steps: float = math.inf
         """Steps of the training that are known to come, towards whose end poses stay as they are."""
-        self._pose_generator = torch.Generator().manual_seed(0)
         self.seconds_a_step: float | None = None
         """What a training step will take; None where nobody needs to know, since it is small."""
         trains = kwargs.get("test_mode", "val") == "val"
@@ -247,39 +247,46 @@ class EnerfPipeline(VanillaPipeline):
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
         """Has the poses corrected, now and then, by what pairs of a training step tell."""
-        every = LOOK_AGAIN_EVERY if refiner.corrected else LOOK_EVERY
+        may_begin = step < BEGINS_UNTIL * self.num_steps
+        every = LOOK_AGAIN_EVERY if refiner.corrected and may_begin else LOOK_EVERY
         if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
         fired = batch.fired.stop
         chosen = torch.zeros(len(batch), dtype=torch.bool)
-        chosen[torch.randperm(fired, generator=self._pose_generator)[:PAIRS]] = True
+        generator = torch.Generator().manual_seed(step)
+        chosen[torch.randperm(fired, generator=generator)[:PAIRS]] = True
         some = batch.subset(chosen.to(batch.pixels.device))
         rays = manager.event_rays(some, sensor)
         times = manager.event_times(some, sensor)
         camera = manager.event_camera
         unit = float(sensor.mean_threshold)
         with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training draws as without looks
-            logs, slopes = render_slopes(
+            rgb, slopes = render_slopes(
                 model,
                 rays,
                 lambda rgb: sensor.log_brightness(rgb, some.pixels.repeat(2)) / unit,
                 camera.axes(times),
                 camera.scale,
             )
-        start, end = logs.chunk(2)
         with torch.no_grad():
-            change = end - start
+            change = brightness_change(*rgb.chunk(2), some, sensor) / unit
             residual = sensor.measured_change(some) / unit - change
             others = torch.stack([change, (some.on + some.off).float(), 1e-9 * (some.end - some.start).float()], dim=1)
+            lags = torch.zeros(2, len(some), 2)  # the clock is told only as far as these do not explain the same
+            if sensor.learns_lag:
+                lags[..., 0] = 1.0 / sensor.cutoff_share(rgb, some.pixels.repeat(2)).view(2, -1).cpu()
+            if sensor.refractory_period and some.starts_at_events:
+                lags[0, :, 1] = 1.0
         refiner.look(
             residual.double().cpu().numpy(),
             slopes,
             times.view(2, -1).cpu().numpy(),
             some.pixels.cpu().numpy(),
             others.double().cpu().numpy(),
+            lags.double().numpy(),
         )
-        if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve(step):
+        if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve(step, may_begin):
             self._correct_poses()
 
     def _correct_poses(self) -> None:
@@ -360,6 +367,9 @@ class EnerfPipeline(VanillaPipeline):
                 save_pictures(aligned_views(views)[0], output_path)
         scores = summary_scores(views, summary, get_std)
         protocol = str(scores["protocol"] if step is None else scores.pop("protocol"))
+        if step is None and self.poses is not None and self.poses.corrected:
+            stated = scores_at_stated_poses(self)
+            scores |= {f"{name}_at_stated_poses": value for name, value in stated.items()}
         CONSOLE.print(described(protocol), soft_wrap=True, highlight=False, markup=False)
         not_scored: Any = scores.pop("not_scored", {})
         for name, reasons in not_scored.items():

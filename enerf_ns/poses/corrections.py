@@ -85,6 +85,18 @@ class Corrections:
         return self.delay != 0.0 or any(self.rotation) or any(self.translation) or self.drift is not None
 
     @property
+    def words(self) -> list[str]:
+        """What is corrected, a few words each; empty where nothing is."""
+        found = [f"poses stamped {self.delay:+.2f} ms late"] * bool(self.delay)
+        found += [f"frames stamped {self.frame_delay:+.2f} ms late"] * bool(self.frame_delay)
+        turn, shift = (float(np.linalg.norm(part)) for part in (self.rotation, self.translation))
+        found += [f"mount turned by {np.degrees(turn):.2f} degrees"] * bool(turn)
+        found += [f"mount shifted by {1e3 * shift:.1f} mm"] * bool(shift)
+        found += [f"focal length {self.focal_scale:.4f} of the stated one"] * (self.focal_scale != 1.0)
+        found += [f"distortion {self.distortion:+.4f}"] * bool(self.distortion)
+        return [*found, *["a drift of the poses"] * (self.drift is not None)]
+
+    @property
     def changes_lens(self) -> bool:
         """Whether the camera of the events is another one than that given."""
         return self.focal_scale != 1.0 or self.distortion != 0.0

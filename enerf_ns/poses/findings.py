@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import evenly_spaced
 from enerf_ns.poses.corrections import Corrections
-from enerf_ns.poses.refiner import TOLD, UNITS, Part, PoseRefiner
+from enerf_ns.poses.refiner import TOLD, Part, PoseRefiner
 
 INSTANTS, PLACES = 64, 5
 """Instants of a recording, and columns and rows of pixels, whose points are followed from poses to others."""
@@ -86,8 +86,7 @@ def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
     }
     found = []
     for part, (what, value, without) in one_by_one.items():
-        units = UNITS[part] if part != "drift" else np.inf
-        told = bool((errors[part] < TOLD * units).all())
+        told = part == "drift" or bool((errors[part] < TOLD * refiner.units[part]).all())
         moved = picture_shift(recording, without, now, distance)
         found.append(Finding(what, value, part in refiner.corrected, told, moved, FLAGS[part]))
     return found

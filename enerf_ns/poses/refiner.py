@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, Literal, Optional
 
@@ -16,8 +17,10 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.poses.corrections import Corrections, DriftBasis
 
 if TYPE_CHECKING:
@@ -35,10 +38,16 @@ UNITS: dict[Part, float] = {
 """How large each number may be expected to be: its unit here, and the standard deviation of what is known of it
 beforehand. Milliseconds, radians, metres, shares."""
 
+STARTS_WITHIN: dict[Part, float] = {"clock": 0.5, "lens": 0.005}
+"""Milliseconds, and share of the focal length, within which what it starts from is right: standard deviation."""
+
+DISTORTION_UNITS = 0.02, 0.2
+"""Smallest and largest unit of the first coefficient of distortion."""
+
 DRIFT_UNITS = np.array([0.01] * 3 + [math.radians(0.5)] * 3)
 """The same of the coefficients of the drift."""
 
-PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = 0.2, 6, 60
+PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = float(__import__("os").environ.get("PIECE", 0.2)), 6, 60
 """Length (s) of the pieces of a drift, and their fewest and most number."""
 
 FIRST_STEP = 50
@@ -47,9 +56,12 @@ FIRST_STEP = 50
 FROZEN_FROM = 0.8
 """Share of the steps after which corrections stay as they are."""
 
+BEGINS_UNTIL = 0.4
+"""Share of the steps after which nothing is corrected that was not before, since the field has to follow."""
+
 LOOK_EVERY, LOOK_AGAIN_EVERY, LOOKS_A_SOLUTION = 4, 2, 6
-"""Steps from which pairs are looked at to the next, the same where something is being corrected, and how often that is
-done before what was seen is solved."""
+"""Steps from which pairs are looked at to the next, the same at first where something is being corrected, and how often
+that is done before what was seen is solved."""
 
 PAIRS = 256
 """Most pairs that are looked at at once."""
@@ -61,11 +73,15 @@ SURE, STAYS = 9.0, 3.0
 """By how much the squared error, in units of its variance, must fall beyond what chance explains before something is
 corrected, and for it to stay so."""
 
-SYSTEMATIC = float(__import__("os").environ.get("SYS", 0.01))
+SYSTEMATIC = float(__import__("os").environ.get("SYS", 0.02))
 """Pixels by which what is rendered may be off as a whole in any one way, however much was seen: standard deviation."""
 
 SETTLED_AFTER = 200.0
 """Steps before which it may be off by more, the more the fewer they are."""
+
+SMALLEST_TURN = math.radians(2.0)
+"""Root mean square angle by which a camera must turn about a second axis for its mount and its lens to be corrected
+without being asked for."""
 
 TOLD = 0.25
 """Largest standard error of numbers that are said to be told, in their units."""
@@ -89,8 +105,9 @@ POWERS = [(i, j, k) for i in range(3) for j in range(3) for k in range(3) if i +
 NUM_SHAPES = len(POWERS)
 """Number of polynomials of the place, up to squares, along each axis, by which the scene may bend."""
 
-NUM_OTHERS = 3
-"""Number of columns of what else may be wrong: contrast, the thresholds' ratio, a leak."""
+NUM_OTHERS = 5
+"""Number of columns of what else may be wrong: the photoreceptor's lag, the refractory period, contrast, the ratio of
+the thresholds, a leak."""
 
 BEND = 0.1
 """How far the scene may be expected to bend, scene units."""
@@ -142,6 +159,14 @@ class PoseRefiner(nn.Module):
     """
 
     value: Tensor
+    """The numbers, in their units."""
+    errors: Tensor
+    is_corrected: Tensor
+    """Of each part."""
+    normal: Tensor
+    """Equations of the numbers and of what is solved for beside them."""
+    right: Tensor
+    looks: Tensor
 
     def __init__(self, config: RefinerConfig, recording: EventRecording):
         super().__init__()
@@ -154,7 +179,9 @@ class PoseRefiner(nn.Module):
         sizes: dict[Part, int] = {"clock": 1, "rotation": 3, "translation": 3, "lens": 1 + has_coefficients}
         sizes["drift"] = 6 * self.basis.size
         ends = np.cumsum([*sizes.values()])
-        self.parts = {part: slice(end - size, end) for (part, size), end in zip(sizes.items(), ends, strict=True)}
+        self.parts: dict[Part, slice] = {
+            part: slice(end - size, end) for (part, size), end in zip(sizes.items(), ends, strict=True)
+        }
         self.number = int(ends[-1])
         whole = self.number + 3 * NUM_SHAPES + NUM_OTHERS
         self.register_buffer("value", torch.zeros(self.number, dtype=torch.float64))
@@ -169,6 +196,8 @@ class PoseRefiner(nn.Module):
         self._before[drift, drift] += np.kron(self.basis.roughness, np.eye(6))
         self._units = np.concatenate([np.full(size, UNITS[part]) for part, size in sizes.items()])
         self._units[drift] = np.tile(DRIFT_UNITS, self.basis.size)
+        if has_coefficients:
+            self._units[self.parts["lens"].stop - 1] = _distortion_unit(recording.camera)
         wanted: dict[Part, bool | None] = {
             "clock": config.refine_clock,
             "rotation": config.refine_mount,
@@ -177,14 +206,27 @@ class PoseRefiner(nn.Module):
             "drift": config.refine_drift,
         }
         self.wanted = [part for part in self.parts if wanted[part] is True]
-        self.allowed = [part for part in self.parts if wanted[part] is not False]
+        turns = turns_about_two_axes(trajectory)
+        self.allowed = [
+            part
+            for part in self.parts
+            if wanted[part] or (wanted[part] is None and (turns or part in ("clock", "drift")))
+        ]
         for number, part in enumerate(self.parts):
             self.is_corrected[number] = wanted[part] is True
         starts: dict[Part, float] = {"clock": config.clock_ms or 0.0, "lens": (config.focal_scale or 1.0) - 1.0}
+        self._expected = np.zeros(whole)
         for part, start in starts.items():
             if start:
-                self.value[self.parts[part].start] = start / UNITS[part]
+                number, unit = self.parts[part].start, UNITS[part]
+                self.value[number] = self._expected[number] = start / unit
+                self._before[number, number] = (unit / STARTS_WITHIN[part]) ** 2
                 self.is_corrected[list(self.parts).index(part)] = True
+
+    @property
+    def units(self) -> dict[Part, Float64[np.ndarray, " numbers"]]:
+        """How large each number may be expected to be: milliseconds, radians, metres, shares."""
+        return {part: self._units[where] for part, where in self.parts.items()}
 
     @property
     def corrected(self) -> list[Part]:
@@ -217,6 +259,7 @@ class PoseRefiner(nn.Module):
         times: Int64[np.ndarray, "2 pairs"],
         pixels: Int64[np.ndarray, " pairs"],
         others: Float64[np.ndarray, "pairs others"],
+        lags: Float64[np.ndarray, "2 pairs lags"],
     ) -> None:
         """Takes in some pairs.
 
@@ -227,13 +270,16 @@ class PoseRefiner(nn.Module):
             pixels: Their numbers, y * width + x.
             others: By how much the change of log brightness, thresholds, changes with what else may be wrong, each
                 about 1.
+            lags: By how much of a millisecond pixels see late, of each of what may be wrong with their lag, at both
+                instants.
         """
         times = times.reshape(-1)
         twists = np.concatenate([slopes.shifts, slopes.turns], axis=1)
-        columns = [*self._columns(twists, slopes, times, np.tile(pixels, 2)).values(), slopes.bends]
-        each = np.concatenate(columns, axis=1)
+        columns = self._columns(twists, slopes, times, np.tile(pixels, 2))
+        by_lag = columns["clock"] * lags.reshape(len(times), -1) * UNITS["clock"]
+        each = np.concatenate([*columns.values(), slopes.bends, by_lag], axis=1)
         each[:, : self.number] *= self._units
-        each[:, self.number :] *= BEND
+        each[:, self.number : self.number + 3 * NUM_SHAPES] *= BEND
         changes = np.concatenate([each[len(residual) :] - each[: len(residual)], others], axis=1)
         weight = 1.0 / np.maximum(np.abs(residual), 1.0)
         variance = max(float((weight * residual**2).sum() / weight.sum()), 1e-6)
@@ -284,11 +330,12 @@ class PoseRefiner(nn.Module):
             self._lens = key, slopes
         return self._lens[1]
 
-    def solve(self, step: int) -> bool:
+    def solve(self, step: int, may_begin: bool = True) -> bool:
         """Corrects what was seen to be wrong.
 
         Args:
             step: Of the training.
+            may_begin: Correct parts, too, that are not corrected yet.
 
         Returns:
             Whether anything changed.
@@ -302,7 +349,10 @@ class PoseRefiner(nn.Module):
         value = np.zeros(len(right))
         for part in self.allowed:
             value[self.parts[part]] = self.value.numpy()[self.parts[part]]
-        parts = self._best_parts(normal, right + normal @ value)
+        absolute = right + normal @ value + self._before @ self._expected
+        parts = self._best_parts(normal, absolute)
+        if not may_begin:
+            parts = tuple(part for part in parts if part in self.corrected)
         if not parts and not self.corrected:
             return False
         for number, part in enumerate(self.parts):
@@ -311,7 +361,7 @@ class PoseRefiner(nn.Module):
         free, own = self._numbers(parts), len(self._numbers(parts)) - (len(right) - self.number)
         damped = normal[np.ix_(free, free)] + self._before[np.ix_(free, free)]
         best = np.zeros(len(right))
-        best[free] = np.linalg.solve(damped, (right + normal @ value)[free])
+        best[free] = np.linalg.solve(damped, absolute[free])
         change = best - value
         change *= min(1.0, LARGEST_STEP / max(float(np.abs(change[: self.number]).max()), 1e-12))
         self.errors.zero_()
@@ -338,6 +388,19 @@ class PoseRefiner(nn.Module):
         whole = np.arange(len(self.right))
         return np.concatenate([*(whole[self.parts[part]] for part in parts), whole[self.number :]])
 
+    def _chance(self, part: Part) -> float:
+        """What numbers that are all nothing hardly ever explain of the squared error, in units of its variance."""
+        size = self.parts[part].stop - self.parts[part].start
+        return size + 3.0 * math.sqrt(2.0 * size) + (STAYS if part in self.corrected else SURE)
+
+    @cached_property
+    def _subsets(self) -> list[tuple[Part, ...]]:
+        """All sets of parts other than the drift that may be corrected."""
+        free = [part for part in self.allowed if part not in self.wanted and part != "drift"]
+        chosen = [some for count in range(len(free) + 1) for some in combinations(free, count)]
+        wanted = [part for part in self.wanted if part != "drift"]
+        return [tuple(part for part in self.parts if part in wanted or part in some) for some in chosen]
+
     def _best_parts(
         self, normal: Float64[np.ndarray, "whole whole"], right: Float64[np.ndarray, " whole"]
     ) -> tuple[Part, ...]:
@@ -346,23 +409,30 @@ class PoseRefiner(nn.Module):
         Args:
             normal, right: Of the equations for all numbers, not for their changes.
         """
-        best, most, beside = (), -math.inf, len(right) - self.number
-        free = [part for part in self.allowed if part not in self.wanted]
-        for count in range(len(free) + 1):
-            for others in combinations(free, count):
-                parts = tuple(part for part in self.parts if part in self.wanted or part in others)
-                numbers = self._numbers(parts)
-                damped = normal[np.ix_(numbers, numbers)] + self._before[np.ix_(numbers, numbers)]
-                covariance = np.linalg.inv(damped)
-                worth = float(right[numbers] @ covariance @ right[numbers])
-                errors = np.full(self.number, 0.0)
-                errors[numbers[:-beside]] = np.sqrt(covariance.diagonal()[:-beside])
-                for part in others:
-                    size = self.parts[part].stop - self.parts[part].start
-                    worth -= size + 3.0 * math.sqrt(2.0 * size) + (STAYS if part in self.corrected else SURE)
-                told = all(part == "drift" or errors[self.parts[part]].max() < TOLD for part in others)
+        damped = normal + self._before
+        small, drift = self.parts["drift"].start, "drift" in self.allowed
+        best: tuple[Part, ...] = ()
+        most = -math.inf
+        for with_drift in (False, True)[: 1 + drift]:
+            if "drift" in self.wanted and not with_drift:
+                continue
+            rest = self._numbers(("drift",) if with_drift else ())
+            across = damped[:small, rest]
+            solved = np.linalg.solve(damped[np.ix_(rest, rest)], np.column_stack([across.T, right[rest]]))
+            own, pull = damped[:small, :small] - across @ solved[:, :-1], right[:small] - across @ solved[:, -1]
+            base = float(right[rest] @ solved[:, -1])
+            if with_drift and "drift" not in self.wanted:
+                base -= self._chance("drift")
+            for others in self._subsets:
+                numbers = np.concatenate([np.arange(small)[self.parts[part]] for part in others] or [np.arange(0)])
+                covariance = np.linalg.inv(own[np.ix_(numbers, numbers)])
+                worth = base + float(pull[numbers] @ covariance @ pull[numbers])
+                worth -= sum(self._chance(part) for part in others if part not in self.wanted)
+                errors = np.zeros(small)
+                errors[numbers] = np.sqrt(covariance.diagonal())
+                told = all(errors[self.parts[part]].max() < TOLD for part in others if part not in self.wanted)
                 if told and worth > most:
-                    best, most = parts, worth
+                    best, most = (*others, *(("drift",) if with_drift else ())), worth
         return best
 
     @property
@@ -379,6 +449,24 @@ class PoseRefiner(nn.Module):
                     f"{LIMITS[part] * UNITS[part]:g}, which no recording is wrong by; check the poses with enerf "
                     "inspect, or train with the poses as they are."
                 )
+
+
+def _distortion_unit(camera: Camera) -> float:
+    """The first coefficient of distortion that moves the picture about as far as the unit of the focal length does."""
+    square = (camera.width**2 + camera.height**2) / 12.0 / camera.fx**2  # mean distance from the middle, x / z
+    return float(np.clip(UNITS["lens"] / square, *DISTORTION_UNITS))
+
+
+def turns_about_two_axes(trajectory: Trajectory) -> bool:
+    """Whether a camera turns far enough for its lens, and how it is mounted, to be told from the scene.
+
+    About one axis alone, a direction of the mount's shift stays open (Tsai and Lenz, IEEE Transactions on Robotics and
+    Automation 1989); without turns, all of the mount and the focal length are as good as another scene.
+    """
+    rotations = Rotation.from_quat(trajectory.quaternions)
+    turns = (rotations.mean().inv() * rotations).as_rotvec()
+    second = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1] / math.sqrt(len(turns))
+    return bool(second > SMALLEST_TURN)
 
 
 @dataclass(frozen=True)
@@ -414,7 +502,7 @@ def render_slopes(
         scale: Scene units per metre.
 
     Returns:
-        Log brightness (rays,), and its slopes.
+        Brightness (rays, channels), and the slopes of what `seen` makes of it.
     """
     if rays.nears is None:
         rays = model.collider(rays)
@@ -432,8 +520,7 @@ def render_slopes(
             outputs = model.field(samples)
             weights = samples.get_weights(outputs[FieldHeadNames.DENSITY])
             rgb = (weights * outputs[FieldHeadNames.RGB]).sum(dim=-2) + MIDDLE_GREY * (1.0 - weights.sum(dim=-2))
-            logs = seen(model.gain * rgb)
-            (slopes,) = torch.autograd.grad(logs.sum(), origins)
+            (slopes,) = torch.autograd.grad(seen(model.gain * rgb).sum(), origins)
     finally:
         for parameter in learned:
             parameter.requires_grad_(True)
@@ -446,4 +533,4 @@ def render_slopes(
     to_origin = scale * (back @ slopes.sum(dim=1)[..., None])[..., 0]
     turns = torch.linalg.cross(local, to_direction)
     found = (column.double().cpu().numpy() for column in (to_origin, turns, to_direction, bends))
-    return logs.detach(), Slopes(*found)
+    return model.gain * rgb.detach(), Slopes(*found)

@@ -22,11 +22,13 @@ from enerf_ns.dataparsers.indexing import index_events
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
 from enerf_ns.evaluation.runs import Run, load
-from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.scores import scores_at_stated_poses, summary_scores
 from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views, held_out_views
+from enerf_ns.poses.findings import findings
 from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
 from enerf_ns.report.film import Screen, render_moving, render_video
 from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
+from enerf_ns.report.pose_figure import corrections_over_time
 from enerf_ns.report.run_files import RunFiles, read_run, run_names
 from enerf_ns.report.scoring import DEFAULT_SCORING, Scoring
 from enerf_ns.report.tables import NONE, Table, history_csv, reach_table, score_cell, step_parts, step_table
@@ -65,6 +67,12 @@ class _Reported:
     video: bytes | None = None
     video_note: str = ""
     """What the video shows, and with which gamma."""
+    poses: list[dict[str, Any]] = field(default_factory=list)
+    """What was found to be wrong with clock, poses and lens, as `Finding.as_dict`."""
+    corrections: bytes | None = None
+    """Picture of what was corrected of the poses."""
+    at_stated_poses: dict[str, float] = field(default_factory=dict)
+    """Scores at the poses as they were stated, where others are used."""
     captions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What is left out or wrong, and what to do about it."""
@@ -186,6 +194,12 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
             one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
             one.protocol = one.scores.pop("protocol")
             views = [views[number] for number in shown]
+        figure = corrections_over_time(dataset.recording)
+        if figure is not None:
+            one.corrections, one.at_stated_poses = _png(figure), scores_at_stated_poses(run.pipeline)
+        refiner, distance = run.pipeline.poses, run.pipeline.datamanager.distance
+        if refiner is not None and refiner.looks:
+            one.poses = [row.as_dict() for row in findings(refiner, distance)]
         depth_range = scene_depth_range(dataset.recording, run.pipeline.datamanager.config.dataparser.depth_range)
         screen = Screen.of(views, depth_range)
         views, _ = aligned_views(views, scoring.protocol)
@@ -278,6 +292,12 @@ def _files(
         "step.png": ("What a training step spends its time on", step_breakdown(steps) if steps else None),
     }
     figures = {name: (title, _png(figure)) for name, (title, figure) in plots.items() if figure is not None}
+    tables += [_poses_table(one, len(reported) > 1) for one in reported if one.poses]
+    figures |= {
+        f"{one.prefix}corrections.png": (_of_run("Corrections of the poses", one, len(reported) > 1), one.corrections)
+        for one in reported
+        if one.corrections is not None
+    }
     return {
         "report.html": _page(reported, tables, figures).encode(),
         "report.md": _markdown(reported, tables, {name: title for name, (title, _) in figures.items()}).encode(),
@@ -348,6 +368,33 @@ def _runs_table(reported: Sequence[_Reported]) -> Table:
              config.machine.device_type, str(one.files.folder)]
         )  # fmt: skip
     return Table("Runs", ["run", "method", "learns from", "recording", "events", "seed", "device", "folder"], rows)
+
+
+def _of_run(title: str, one: _Reported, of_several: bool) -> str:
+    return f"{title}, {one.name}" if of_several else title
+
+
+def _poses_table(one: _Reported, of_several: bool) -> Table:
+    """What was found to be wrong with clock, poses and lens of a run."""
+    rows = [
+        [
+            row["what"],
+            "corrected" if row["is_corrected"] else "as stated",
+            row["value"] if row["is_told"] else f"not told ({row['value']})",
+            f"{row['pixels']:.2g} pixels" if row["is_corrected"] else NONE,
+            row["flag"],
+        ]
+        for row in one.poses
+    ]
+    note = "With standard errors. What events do not tell, or what is told to be nothing, stays as it was stated."
+    if one.at_stated_poses:
+        scores = ", ".join(f"{SCORES[name]} {score_cell(name, value)}" for name, value in one.at_stated_poses.items())
+        note += (
+            " All scores above are at the corrected poses, which no held-out frame was fitted to; at the poses as they "
+            f"were stated: {scores}."
+        )
+    header = ["part", "", "found", "moves the picture by", "flag"]
+    return Table(_of_run("Clock, poses and lens", one, of_several), header, rows, note)
 
 
 def _not_scored(one: _Reported) -> list[str]:

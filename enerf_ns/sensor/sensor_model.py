@@ -253,7 +253,7 @@ class SensorModel(nn.Module):
         lags = []
         for instant, rgb in enumerate((start, end)):
             slope = slopes[:, instant]
-            share = (255.0 * self.brightness(rgb.detach(), batch.pixels) + 20.0) / 275.0
+            share = self.cutoff_share(rgb.detach(), batch.pixels)
             if batch.slopes is None or not self.learns_lag:
                 lag = (self.delay / share + self.second_delay) * slope
             else:
@@ -262,6 +262,12 @@ class SensorModel(nn.Module):
                 lag = lag + (delay - delay.detach()) / share * batch.slopes[:, instant]  # 0, with a gradient
             lags.append((1e-3 * lag).clamp(-LARGEST_LAG, LARGEST_LAG))
         return lags[1] - lags[0]
+
+    def cutoff_share(
+        self, rgb: Float[Tensor, "*batch channels"], pixels: Int64[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Cut-off frequency of pixels, as a share of that at brightness 1; arguments as of `log_brightness`."""
+        return (255.0 * self.brightness(rgb, pixels) + 20.0) / 275.0
 
     @torch.no_grad()
     def observe(self, change: Float[Tensor, " pairs"], batch: EventBatch) -> None:

@@ -17,6 +17,8 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.trajectory import Trajectory
 from enerf_ns.enerf_datamanager import EnerfDataManager
 from enerf_ns.enerf_model import EnerfModel, Outputs
 from enerf_ns.viewer.overlay import draw_events, for_the_eye, recent_events
@@ -60,6 +62,9 @@ LOOKED_EVERY = 1.1
 ACCENT = (255, 211, 105)
 """Colour of the trajectory and the sensor."""
 
+STATED = (150, 150, 150)
+"""Colour of the trajectory as it was stated, where it was corrected."""
+
 
 class SceneView(ViewerControl):
     """Makes a viewer of Nerfstudio's one on a recording, when it starts (`_setup`).
@@ -78,7 +83,6 @@ class SceneView(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
-        self._recording = self._manager.recording
         outputs = self._manager.train_dataparser_outputs
         self._transform, self._scale = outputs.metadata["transform"].numpy(), outputs.dataparser_scale
         self._camera = self._recording.camera.undistorted()
@@ -89,6 +93,11 @@ class SceneView(ViewerControl):
         self._draw_recording()
         self._add_panel()
         self.viser_server.on_client_connect(self._open)
+
+    @property
+    def _recording(self) -> EventRecording:
+        """With the poses as they are corrected by now."""
+        return self._manager.recording
 
     def _look_from_the_middle(self) -> None:
         """Finds the first view: what lies before the camera that is the middle one in time, and at which depth."""
@@ -129,19 +138,11 @@ class SceneView(ViewerControl):
 
     def _draw_recording(self) -> None:
         """The trajectory, and the sensor on it."""
-        times = self._recording.instants(PATH_POINTS)
-        self._path = np.stack([self._pose(int(t))[:, 3] for t in times])
         self._drawn = [
             self.viser_server.scene.add_frame("/cameras", show_axes=False),
             self.viser_server.scene.add_frame("/recording", show_axes=False),
         ]
-        self.viser_server.scene.add_spline_catmull_rom(
-            "/recording/path",
-            self._path * VISER_NERFSTUDIO_SCALE_RATIO,
-            color=ACCENT,
-            line_width=2.0,
-            segments=PATH_POINTS,
-        )
+        self._draw_path()
         self._sensor = self.viser_server.scene.add_camera_frustum(
             "/recording/sensor",
             fov=2.0 * np.arctan(0.5 * self._camera.height / self._camera.fy),
@@ -149,6 +150,24 @@ class SceneView(ViewerControl):
             scale=self.viewer.config.camera_frustum_scale,
             color=ACCENT,
         )
+
+    def _draw_path(self) -> None:
+        """The trajectory as it is corrected by now, and in grey as it was stated, where that is another one."""
+        recording, self._path_of = self._recording, self._manager.corrections
+        times = recording.instants(PATH_POINTS)
+        self._path = np.stack([self._pose(int(t))[:, 3] for t in times])
+        lines: dict[str, tuple[np.ndarray, tuple[int, int, int]]] = {"path": (self._path, ACCENT)}
+        if recording.as_read is not None:
+            stated = recording.as_read.trajectory
+            lines["stated"] = np.stack([self._pose(int(t), stated)[:, 3] for t in times]), STATED
+        for name, (points, colour) in lines.items():
+            self.viser_server.scene.add_spline_catmull_rom(
+                f"/recording/{name}",
+                points * VISER_NERFSTUDIO_SCALE_RATIO,
+                color=colour,
+                line_width=2.0,
+                segments=PATH_POINTS,
+            )
 
     def _add_panel(self) -> None:
         gui, (first, last) = self.viser_server.gui, np.array(self._recording.span) * 1e-9
@@ -163,6 +182,7 @@ class SceneView(ViewerControl):
             self._stops = gui.add_slider("Brightness", -4.0, 4.0, 0.1, 0.0, hint="Stops; each doubles the brightness")
             self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
             self._depths = gui.add_markdown("")
+            self._corrected = gui.add_markdown(self._corrections_in_words)
         for handle in (self._events, self._window, self._stops, self._gamma):
             handle.on_update(lambda _: self.viewer._trigger_rerender())
         self._time.on_update(lambda _: self._move())
@@ -213,9 +233,14 @@ class SceneView(ViewerControl):
         if abs(view.fov - fov) > 0.01:
             view.fov = fov
 
-    def _pose(self, time_ns: int) -> Float64[np.ndarray, "3 4"]:
-        """The sensor in the scene, OpenCV axes."""
-        pose = self._recording.trajectory.poses(torch.tensor(time_ns)).numpy()
+    @property
+    def _corrections_in_words(self) -> str:
+        words = self._manager.corrections.words
+        return f"Corrected: {'; '.join(words)}. Grey: the path as it was stated." if words else ""
+
+    def _pose(self, time_ns: int, trajectory: Trajectory | None = None) -> Float64[np.ndarray, "3 4"]:
+        """The sensor in the scene, OpenCV axes, on its own trajectory or on another one."""
+        pose = (trajectory or self._recording.trajectory).poses(torch.tensor(time_ns)).numpy()
         rotation, shift = self._transform[:, :3], self._transform[:, 3]
         return np.column_stack([rotation @ pose[:, :3], self._scale * (rotation @ pose[:, 3] + shift)])
 
@@ -268,6 +293,9 @@ class SceneView(ViewerControl):
         if at_rest and self.viewer.trainer is not None and step >= max(FIRST_SEEN, SEEN_EVERY * self._seen_at):
             self._seen = self._seen_now()
             self._seen_at = step
+        if at_rest and self._manager.corrections is not self._path_of:
+            self._draw_path()
+            self._corrected.content = self._corrections_in_words
         if self._seen is None or model.config.contraction:
             return
         nears, fars = self._seen.span(rays.origins, rays.directions)

@@ -1,0 +1,278 @@
+"""What refining clock, mount, lens and trajectory is worth where they are wrong, and what it costs where they are not.
+
+Simulates recordings of the validation set and the demo's, thins their poses out to 200 a second, makes each wrong in
+one way or in all, and trains with the right poses, with the wrong ones as they are, and with the wrong ones refined;
+nothing is told of what is wrong. Writes a line of JSON for each training to --output, where it goes on when it is
+called again, and prints a table of means over the seeds.
+
+    python benchmarks/pose_refinement.py --recordings shapes clutter --faults none clock-5 all --seeds 3 --steps 1000
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+POSES_EVERY_NS = 5_000_000
+DRIFT_KNOTS = 5
+EDGE_NS = 20_000_000
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "none": {},
+    **{f"clock-{delay}": {"clock": delay} for delay in (2, 5, 10, 20)},
+    "noise": {"noise": (1.0, 0.1)},
+    "drift-5": {"drift": (5.0, 0.3)},
+    "drift-10": {"drift": (10.0, 0.5)},
+    "drift-20": {"drift": (20.0, 1.0)},
+    "mount": {"mount": (5.0, 1.0)},
+    **{f"focal-{share}": {"focal": 1.0 + share / 100.0} for share in (1, 3, 10)},
+    "all": {"clock": 10, "mount": (5.0, 1.0), "focal": 1.03, "drift": (10.0, 0.5), "noise": (1.0, 0.1)},
+}
+"""What is wrong: milliseconds of the poses' clock; millimetres and degrees of white noise, of a smooth drift at its
+largest, and of the mount; the focal length as a multiple of the right one."""
+
+OFF = {f"pipeline.poses.refine_{part}": False for part in ("clock", "mount", "lens", "drift")} | {
+    "pipeline.datamanager.dataparser.smooth_poses": False
+}
+ROWS = {"fixed": OFF, "refined": {}}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", nargs="+", default=["shapes", "clutter", "floor", "relief-large"])
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
+    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--jobs", type=int, default=2, help="trainings side by side, of one thread each")
+    parser.add_argument("--work", type=Path, default=Path("outputs/pose-refinement"))
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/pose-refinement.jsonl"))
+    parser.add_argument("--cell", help="one training, as JSON; for the program itself")
+    arguments = parser.parse_args()
+    if arguments.cell:
+        print(json.dumps(trained(json.loads(arguments.cell), arguments.work)))
+        return
+    done = [json.loads(line) for line in arguments.output.read_text().splitlines()] if arguments.output.exists() else []
+    keys = ("recording", "fault", "row", "seed", "steps")
+    known = {tuple(result[key] for key in keys) for result in done}
+    cells = [
+        dict(zip(keys, cell, strict=True))
+        for seed in range(arguments.seeds)
+        for fault in arguments.faults
+        for recording in arguments.recordings
+        for row in arguments.rows
+        if (cell := (recording, fault, row, seed, arguments.steps)) not in known
+    ]
+    for recording in arguments.recordings:
+        right_poses(recording, arguments.work)
+
+    def run(cell: dict[str, Any]) -> None:
+        command = [sys.executable, __file__, "--work", str(arguments.work), "--cell", json.dumps(cell)]
+        threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        told = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **threads})
+        if told.returncode:
+            print(f"{cell} failed: {told.stderr.strip().splitlines()[-1:]}", flush=True)
+            return
+        result = json.loads(told.stdout.strip().splitlines()[-1])
+        with arguments.output.open("a") as file:
+            file.write(json.dumps(result) + "\n")
+        done.append(result)
+        print(f"{cell}: {result['psnr']:.2f} dB", flush=True)
+
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        list(pool.map(run, cells))
+    chosen = [
+        result
+        for result in done
+        if result["recording"] in arguments.recordings
+        and result["fault"] in arguments.faults
+        and result["steps"] == arguments.steps
+    ]
+    print(table(chosen))
+
+
+def right_poses(name: str, work: Path) -> Path:
+    """The recording in the layout event_recording, simulated once."""
+    from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
+    from enerf_ns.dataparsers.formats.conversion import convert_recording
+    from enerf_ns.simulator.engine import simulate
+    from enerf_ns.simulator.settings import SimulationSettings
+
+    folder = work / name / "right"
+    if folder.exists():
+        return folder
+    if name == "shapes":
+        settings = SimulationSettings(width=160, height=120)
+    else:
+        sequence = (CHOSEN_ON | ONLY_SCORED)[name]
+        (work / name).mkdir(parents=True, exist_ok=True)
+        for file, content in sequence.files.items():
+            (work / name / file).write_text(content)
+        files = {"key_frames": work / name / str(sequence.simulation["key_frames"])}
+        settings = SimulationSettings(scene=str(work / name / str(sequence.scene)), **{**sequence.simulation, **files})
+    simulate(settings, work / name / "simulated")
+    convert_recording(work / name / "simulated", folder)
+    return folder
+
+
+def made_wrong(right: Path, folder: Path, fault: dict[str, Any], seed: int) -> None:
+    """A folder whose events and frames are links to the right ones, and whose poses or calibration are wrong."""
+    random = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in right.iterdir():
+        link = folder / file.name
+        if file.name not in ("poses.txt", "recording.json") and not link.exists():
+            link.symlink_to(file.resolve())
+    rows = np.loadtxt(right / "poses.txt")
+    thin = max(1, round(POSES_EVERY_NS / np.median(np.diff(rows[:, 0]))))
+    rows = np.unique(np.concatenate([rows[::thin], rows[-1:]]), axis=0)
+    times, positions, turns = rows[:, 0].astype(np.int64), rows[:, 1:4], Rotation.from_quat(rows[:, 4:])
+
+    def direction() -> np.ndarray:
+        vector = random.normal(size=3)
+        return vector / np.linalg.norm(vector)
+
+    def moved(shifts: np.ndarray, vectors: np.ndarray) -> None:
+        nonlocal positions, turns
+        positions = positions + turns.apply(1e-3 * shifts)
+        turns = turns * Rotation.from_rotvec(np.radians(vectors))
+
+    if "mount" in fault:
+        millimetres, degrees = fault["mount"]
+        moved(millimetres * direction(), degrees * direction())
+    if "drift" in fault:
+        knots = np.linspace(times[0], times[-1], DRIFT_KNOTS)
+        values = CubicSpline(knots, random.normal(size=(DRIFT_KNOTS, 6)))(times)
+        values -= values.mean(axis=0)
+        parts = [values[:, :3], values[:, 3:]]
+        moved(
+            *(
+                size * part / np.linalg.norm(part, axis=1).max()
+                for size, part in zip(fault["drift"], parts, strict=True)
+            )
+        )
+    if "noise" in fault:
+        millimetres, degrees = fault["noise"]
+        moved(millimetres * random.normal(size=positions.shape), degrees * random.normal(size=positions.shape))
+    times = times + round(1e6 * fault.get("clock", 0.0))
+    about = json.loads((right / "recording.json").read_text())
+    for key in ("fx", "fy"):
+        about["camera"][key] *= fault.get("focal", 1.0)
+    (folder / "recording.json").write_text(json.dumps(about))
+    lines = (
+        f"{time} {' '.join(map(repr, [*position, *turn]))}"
+        for time, position, turn in zip(times, positions.tolist(), turns.as_quat().tolist(), strict=True)
+    )
+    (folder / "poses.txt").write_text("\n".join(["# t_ns px py pz qx qy qz qw", *lines]) + "\n")
+
+
+def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
+    """Scores of one training, and by how much its poses are off the right ones."""
+    from contextlib import redirect_stdout
+
+    from enerf_ns.dataparsers.formats.registry import read_recording
+    from enerf_ns.evaluation.runs import method_config, train
+    from enerf_ns.evaluation.scores import mean_scores
+    from enerf_ns.evaluation.views import held_out_views
+
+    name, seed = cell["recording"], cell["seed"]
+    right = right_poses(name, work)
+    folder = work / name / f"{cell['fault']}-{seed}"
+    if not (folder / "poses.txt").exists():
+        made_wrong(right, folder, FAULTS[cell["fault"]], seed)
+    changes = {
+        "machine.seed": seed,
+        "max_num_iterations": cell["steps"],
+        "evaluation_share": 0.0,
+        **ROWS[cell["row"]],
+    }
+    config = method_config("enerf", folder, work / "runs", changes)
+    config.timestamp = "-".join(str(value) for value in cell.values())
+    with redirect_stdout(sys.stderr):
+        run = train(config)
+        views, _ = held_out_views(run.pipeline)
+        scores, _ = mean_scores(views, False, "log-affine-set", ())
+        events = run.pipeline.event_scores()
+    manager, refiner = run.pipeline.datamanager, run.pipeline.poses
+    true = read_recording(right).trajectory
+    before, after = manager.recording.as_read or manager.recording, manager.recording
+    given = read_recording(folder)
+    return {
+        **cell,
+        **{key: float(scores[key]) for key in ("psnr", "ssim", "depth_rmse") if isinstance(scores.get(key), float)},
+        "event_correlation": events["event_correlation"],
+        "seconds": run.train_seconds,
+        "corrected": [] if refiner is None else refiner.corrected,
+        "clock": manager.corrections.delay,
+        "focal": after.camera.fx / before.camera.fx,
+        "ate_before": errors(true, given.trajectory),
+        "ate_after": errors(true, after.trajectory),
+    }
+
+
+def errors(true: Any, other: Any) -> tuple[float, float]:
+    """Root mean square errors of positions (mm), after the best rigid alignment, and of rotations (degrees), after the
+    best constant one in the axes of the camera."""
+    import torch
+
+    first, last = max(true.start, other.start) + EDGE_NS, min(true.end, other.end) - EDGE_NS
+    times = torch.from_numpy(np.linspace(first, last, 400).astype(np.int64))
+    right, found = (one.poses(times).numpy() for one in (true, other))
+    centred = [poses[:, :, 3] - poses[:, :, 3].mean(axis=0) for poses in (right, found)]
+    turn, _ = Rotation.align_vectors(centred[0], centred[1])
+    off = centred[0] - turn.apply(centred[1])
+    turns = Rotation.from_matrix(right[:, :, :3].transpose(0, 2, 1) @ found[:, :, :3])
+    left = (turns.mean().inv() * turns).as_rotvec()
+    return 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((left**2).sum(axis=1).mean())))
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Means over the seeds, a line for each recording and fault."""
+    cells: dict[tuple[str, str], dict[str, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
+    for result in results:
+        cells[result["recording"], result["fault"]][result["row"]].append(result)
+
+    def mean(rows: list[dict[str, Any]], key: str, number: int | None = None) -> float:
+        values = [row[key] if number is None else row[key][number] for row in rows if key in row]
+        return float(np.mean(values)) if values else float("nan")
+
+    head = (
+        "recording", "wrong", "seeds", "PSNR fixed", "refined", "right", "correlation fixed", "refined",
+        "trajectory, mm", "refined", "degrees", "refined", "clock, ms", "focal length", "time refined / fixed",
+    )  # fmt: skip
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for (recording, fault), rows in cells.items():
+        fixed, refined = rows["fixed"], rows["refined"]
+        right = cells[recording, "none"]["fixed"]
+        numbers = [
+            recording,
+            fault,
+            str(max(len(fixed), len(refined))),
+            *(f"{mean(some, 'psnr'):.2f}" for some in (fixed, refined, right)),
+            *(f"{mean(some, 'event_correlation'):.3f}" for some in (fixed, refined)),
+            f"{mean(refined, 'ate_before', 0):.2f}",
+            f"{mean(refined, 'ate_after', 0):.2f}",
+            f"{mean(refined, 'ate_before', 1):.3f}",
+            f"{mean(refined, 'ate_after', 1):.3f}",
+            ", ".join(f"{row['clock']:.2f}" for row in refined),
+            ", ".join(f"{row['focal']:.4f}" for row in refined),
+            f"{mean(refined, 'seconds') / mean(fixed, 'seconds'):.2f}",
+        ]
+        lines.append(f"| {' | '.join(numbers)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""What was corrected of a trajectory, drawn."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.report.figures import COLOURS, GREY, WIDTH
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INSTANTS = 400
+"""Instants of the recording that are drawn."""
+
+
+def corrections_over_time(recording: EventRecording) -> Figure | None:
+    """The path as it was stated and as it was refined, seen along the axis in which it is shortest; and shift and
+    rotation from one to the other over time, in the axes of the camera. None where nothing was refined."""
+    if recording.as_read is None:
+        return None
+    from matplotlib.figure import Figure
+
+    times = recording.instants(INSTANTS)
+    stated, refined = (
+        trajectory.poses(torch.from_numpy(times)).numpy()
+        for trajectory in (recording.as_read.trajectory, recording.trajectory)
+    )
+    back = stated[:, :, :3].transpose(0, 2, 1)
+    shift = 1e3 * (back @ (refined[:, :, 3:] - stated[:, :, 3:]))[..., 0]
+    turn = np.degrees(Rotation.from_matrix(back @ refined[:, :, :3]).as_rotvec())
+    seconds = 1e-9 * times
+    across, up = sorted(np.argsort(np.ptp(refined[:, :, 3], axis=0))[1:])
+
+    figure = Figure(figsize=(WIDTH, 7.0), layout="constrained", dpi=150)
+    path, *others = figure.subplots(3, 1, height_ratios=(2, 1, 1))
+    path.plot(*stated[:, (across, up), 3].T, color=GREY, linestyle="--", label="as stated")
+    path.plot(*refined[:, (across, up), 3].T, color=COLOURS[0], label="as refined")
+    path.set_xlabel(f"{'xyz'[across]}, m")
+    path.set_ylabel(f"{'xyz'[up]}, m")
+    path.set_aspect("equal", adjustable="datalim")
+    path.legend(frameon=False)
+    for axis, values, label in zip(others, (shift, turn), ("shift, mm", "rotation, degrees"), strict=True):
+        for number, name in enumerate(("x, right", "y, down", "z, forward")):
+            axis.plot(seconds, values[:, number], color=COLOURS[number], label=name)
+        axis.set_ylabel(label)
+    others[0].legend(frameon=False, ncols=3)
+    others[1].sharex(others[0])
+    others[1].set_xlabel("time, s")
+    for axis in (path, *others):
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure

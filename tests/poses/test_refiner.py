@@ -1,0 +1,262 @@
+"""What the refiner finds, of numbers that are known: slopes against finite differences, solutions against what was put
+in, and a training with a wrong clock against the right one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import Frustums, RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from recordings import write_event_recording
+from scipy.spatial.transform import Rotation
+from small_runs import SMALL
+from torch import nn
+
+from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.poses.corrections import Corrections
+from enerf_ns.poses.findings import findings, picture_shift
+from enerf_ns.poses.posed_camera import PosedCamera
+from enerf_ns.poses.refiner import NUM_SHAPES, Part, PoseRefiner, RefinerConfig, Slopes, render_slopes
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+SPAN = 1_000_000_000
+TURNS = 0.2
+
+
+def trajectory(turns: float = TURNS) -> Trajectory:
+    """Shakes, and turns about two axes, over a second."""
+    times = np.arange(0, SPAN + 1, 5_000_000)
+    phase = 2.0 * np.pi * times / SPAN
+    positions = 0.1 * np.stack([np.sin(3 * phase), np.cos(2 * phase), np.sin(phase)], axis=1)
+    vectors = turns * np.stack([np.cos(2 * phase), np.sin(3 * phase), 0.1 * np.sin(phase)], axis=1)
+    return Trajectory(times, positions, Rotation.from_rotvec(vectors).as_quat())
+
+
+def recording(turns: float = TURNS) -> EventRecording:
+    return EventRecording(Path("made"), "made", CAMERA, trajectory(turns), lambda: iter(()), ())
+
+
+class Smooth(nn.Module):
+    """A field of waves, whose slopes are those of its formula."""
+
+    def forward(self, samples: RaySamples) -> dict[Any, torch.Tensor]:
+        places = samples.frustums.get_positions()
+        density = 2.0 + torch.sin(3.0 * places[..., :1]) * torch.cos(2.0 * places[..., 1:2])
+        colour = 0.5 + 0.3 * torch.sin(4.0 * places[..., :1] + 2.0 * places[..., 1:2] - places[..., 2:])
+        return {FieldHeadNames.DENSITY: density, FieldHeadNames.RGB: colour}
+
+
+def sampled(rays: Any) -> tuple[RaySamples, list, list]:
+    edges = torch.linspace(0.5, 2.5, 41).expand(len(rays), -1)[..., None]
+    starts, ends = edges[:, :-1], edges[:, 1:]
+    frustums = Frustums(
+        rays.origins[:, None].expand(-1, 40, -1),
+        rays.directions[:, None].expand(-1, 40, -1),
+        starts,
+        ends,
+        torch.ones_like(starts),
+    )
+    return RaySamples(frustums, deltas=ends - starts), [], []
+
+
+def smooth_model() -> Any:
+    return SimpleNamespace(field=Smooth(), collider=lambda rays: rays, _samples=sampled, gain=1.0)
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_slopes_are_those_of_finite_differences(number: int):
+    """Of brightness, with shifts (metres) and rotation vectors of the camera."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.randint(64 * 48, (40,), generator=generator)
+    times = torch.randint(SPAN, (40,), generator=generator)
+    transform = torch.from_numpy(np.column_stack([Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), [0.1, 0.2, 0.3]]))
+    posed, model = PosedCamera(CAMERA, trajectory(), transform, 0.7), smooth_model()
+
+    def brightness(step: float) -> torch.Tensor:
+        corrections = torch.zeros(40, 6)
+        corrections[:, number] = step
+        rays = posed.rays(pixels, times, corrections=corrections)
+        return render_slopes(model, rays, lambda rgb: rgb[:, 0], posed.axes(times), posed.scale)[0][:, 0].double()
+
+    _, slopes = render_slopes(model, posed.rays(pixels, times), lambda rgb: rgb[:, 0], posed.axes(times), posed.scale)
+    found = np.concatenate([slopes.shifts, slopes.turns], axis=1)[:, number]
+    expected = ((brightness(3e-3) - brightness(-3e-3)) / 6e-3).numpy()
+    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0.05
+
+
+def looks(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float, number: int = 60, seed: int = 0) -> None:
+    """Has a refiner look at pairs whose brightness is a random linear function of the ray, as if poses were wrong."""
+    random = np.random.default_rng(seed)
+    for _ in range(number):
+        times = random.integers(0, SPAN, (2, 256))
+        pixels = random.integers(0, CAMERA.width * CAMERA.height, 256)
+        bends = random.normal(size=(512, 3 * NUM_SHAPES))
+        slopes = Slopes(*(200.0 * random.normal(size=(512, 3)) for _ in range(3)), bends)
+        others, lags = random.normal(size=(256, 3)), np.zeros((2, 256, 2))
+        twists = np.concatenate([slopes.shifts, slopes.turns], axis=1)
+        columns = refiner._columns(twists, slopes, times.reshape(-1), np.tile(pixels, 2))
+        seen = sum(columns[part] @ np.atleast_1d(value) for part, value in wrong.items()) + np.zeros(512)
+        residual = seen[256:] - seen[:256] + noise * random.normal(size=256)
+        refiner.look(residual, slopes, times, pixels, others, lags)
+
+
+def solved(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float = 0.3) -> None:
+    """Looks and solves until nothing is left, as while a field is trained that knows the scene."""
+    for number in range(25):
+        left = {part: np.atleast_1d(value) - found(refiner, part) for part, value in wrong.items()}
+        looks(refiner, left, noise, 6, number)
+        refiner.solve(400)
+
+
+def found(refiner: PoseRefiner, part: Part) -> np.ndarray:
+    return (refiner.value.numpy() * refiner._units)[refiner.parts[part]]
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("clock", [4.0]),
+        ("rotation", np.radians([0.8, -0.5, 0.3])),
+        ("translation", [0.004, -0.006, 0.003]),
+        ("lens", [0.03, -0.02]),
+    ],
+)
+def test_the_part_that_is_wrong_is_found_and_no_other(part: Part, value: Any):
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    solved(refiner, {part: value})
+    assert refiner.corrected == [part]
+    np.testing.assert_allclose(found(refiner, part), value, atol=0.1 * np.abs(value).max())
+    assert refiner.value.count_nonzero() == len(value)
+
+
+def test_two_parts_are_found_together():
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    solved(refiner, {"clock": [3.0], "lens": [0.02, 0.0]})
+    assert set(refiner.corrected) >= {"clock", "lens"}
+    assert found(refiner, "clock")[0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_drift_is_found():
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    wrong = np.random.default_rng(5).normal(size=(refiner.basis.size, 6)) * ([0.005] * 3 + [0.004] * 3)
+    solved(refiner, {"drift": wrong.reshape(-1)})
+    assert refiner.corrected == ["drift"]
+    functions = refiner.basis.at(np.linspace(0, SPAN, 101).astype(np.int64))
+    left, whole = functions @ (found(refiner, "drift").reshape(-1, 6) - wrong), functions @ wrong
+    assert ((left**2).mean(axis=0) < 0.15 * (whole**2).mean(axis=0)).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_wrong_is_left_alone(seed: int):
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    looks(refiner, {}, 1.0, 60, seed)
+    assert not refiner.solve(400)
+    assert refiner.corrected == [] and refiner.value.count_nonzero() == 0
+    assert not refiner.corrections.moves_poses
+
+
+def test_what_the_scene_can_take_up_is_not_taken_for_a_wrong_pose():
+    """A difference that a bent scene explains moves nothing."""
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    random = np.random.default_rng(0)
+    bend = 0.02 * random.normal(size=3 * NUM_SHAPES)
+    for _ in range(60):
+        slopes = Slopes(
+            *(random.normal(size=(512, 3)) for _ in range(3)), 50.0 * random.normal(size=(512, 3 * NUM_SHAPES))
+        )
+        bent = slopes.bends @ bend
+        residual = bent[256:] - bent[:256] + 0.1 * random.normal(size=256)
+        times, pixels = random.integers(0, SPAN, (2, 256)), random.integers(0, 3072, 256)
+        refiner.look(residual, slopes, times, pixels, np.zeros((256, 3)), np.zeros((2, 256, 2)))
+    assert not refiner.solve(400)
+
+
+def test_flags_force_and_forbid():
+    refiner = PoseRefiner(RefinerConfig(refine_clock=False, refine_lens=True), recording())
+    assert refiner.corrected == ["lens"] and "clock" not in refiner.allowed
+    looks(refiner, {"clock": [4.0]}, 0.3)
+    refiner.solve(400)
+    assert found(refiner, "clock")[0] == 0.0 and "lens" in refiner.corrected
+
+
+def test_a_clock_that_is_stated_stays():
+    refiner = PoseRefiner(RefinerConfig(clock_ms=3.0, refine_clock=False), recording())
+    looks(refiner, {"rotation": np.radians([0.8, -0.5, 0.3])}, 0.3)
+    assert refiner.solve(400)
+    assert refiner.corrections.delay == 3.0
+
+
+def test_a_camera_that_turns_about_one_axis_tells_neither_mount_nor_lens():
+    refiner = PoseRefiner(RefinerConfig(), recording(turns=0.01))
+    assert refiner.allowed == ["clock", "drift"]
+
+
+def test_what_no_recording_is_wrong_by_is_an_error():
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    with pytest.raises(RecordingError, match="clock would have to be corrected by more than 100"):
+        for number in range(40):
+            looks(refiner, {"clock": [60.0]}, 0.3, 6, number)
+            refiner.solve(400)
+
+
+def test_a_stored_refiner_goes_on_where_it_was():
+    first = PoseRefiner(RefinerConfig(), recording())
+    looks(first, {"clock": [4.0]}, 0.3)
+    first.solve(400)
+    second = PoseRefiner(RefinerConfig(), recording())
+    second.load_state_dict(first.state_dict())
+    for refiner in (first, second):
+        looks(refiner, {"clock": [1.0]}, 0.3, seed=9)
+        refiner.solve(400)
+    assert second.corrected == first.corrected == ["clock"]
+    assert torch.equal(first.value, second.value)
+
+
+def test_findings_say_what_was_found_and_what_is_not_told():
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    solved(refiner, {"clock": [4.0]})
+    clock, *others = findings(refiner, 2.0)
+    assert clock.is_corrected and clock.is_told and clock.value.startswith("+4.0") and clock.flag.endswith("clock")
+    assert not any(row.is_corrected for row in others) and all(row.pixels < 1e-6 for row in others)
+    nothing = findings(PoseRefiner(RefinerConfig(), recording()), 2.0)
+    assert not any(row.is_told for row in nothing if row.what != "drift")
+
+
+def test_a_pictures_shift_is_that_of_the_focal_length_and_of_a_turn():
+    """A turn about the optical axis by a small angle moves a pixel by its distance from the middle times the angle."""
+    made = recording()
+    columns, rows = np.meshgrid(np.linspace(0, 63, 5).round(), np.linspace(0, 47, 5).round())
+    away = np.sqrt(((columns - 32.0) ** 2 + (rows - 24.0) ** 2).mean())
+    assert picture_shift(made, Corrections(), Corrections(focal_scale=1.01), 2.0) == pytest.approx(
+        0.01 * away, rel=0.02
+    )
+    assert picture_shift(made, Corrections(), Corrections(rotation=(0.0, 0.0, 0.01)), 2.0) == pytest.approx(
+        0.01 * away, rel=0.02
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 6.0])
+def test_a_training_finds_the_clock(recording: Path, tmp_path: Path, delay: float):
+    given = read_recording(recording)
+    moving = given.trajectory
+    late = Trajectory(moving.times + round(delay * 1e6), moving.positions, moving.quaternions)
+    changed = replace(given, trajectory=late, frames=None, blurred_frames=None)
+    folder = write_event_recording(changed, tmp_path / "late")
+    changes = SMALL | {"max_num_iterations": 300, "pipeline.datamanager.event_pairs": 512}
+    run = train(method_config("enerf", folder, tmp_path / "runs", changes))
+    refiner = run.pipeline.poses
+    assert refiner is not None
+    assert refiner.corrections.delay == pytest.approx(delay, abs=0.5)
