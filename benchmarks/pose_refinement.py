@@ -74,8 +74,11 @@ def main() -> None:
         for row in arguments.rows
         if (cell := (recording, fault, row, seed, arguments.steps)) not in known
     ]
-    for recording in arguments.recordings:
-        right_poses(recording, arguments.work)
+    for cell in cells:
+        right = right_poses(cell["recording"], arguments.work)
+        folder = arguments.work / cell["recording"] / f"{cell['fault']}-{cell['seed']}"
+        if not (folder / "poses.txt").exists():
+            made_wrong(right, folder, FAULTS[cell["fault"]], cell["seed"])
 
     def run(cell: dict[str, Any]) -> None:
         command = [sys.executable, __file__, "--work", str(arguments.work), "--cell", json.dumps(cell)]
@@ -106,24 +109,22 @@ def main() -> None:
 def right_poses(name: str, work: Path) -> Path:
     """The recording in the layout event_recording, simulated once."""
     from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
-    from enerf_ns.dataparsers.formats.conversion import convert_recording
     from enerf_ns.simulator.engine import simulate
     from enerf_ns.simulator.settings import SimulationSettings
 
     folder = work / name / "right"
     if folder.exists():
         return folder
-    if name == "shapes":
-        settings = SimulationSettings(width=160, height=120)
+    (work / name).mkdir(parents=True, exist_ok=True)
+    sequence = (CHOSEN_ON | ONLY_SCORED).get(name)
+    if sequence is None:
+        settings = SimulationSettings(name, layout="event_recording")
     else:
-        sequence = (CHOSEN_ON | ONLY_SCORED)[name]
-        (work / name).mkdir(parents=True, exist_ok=True)
         for file, content in sequence.files.items():
             (work / name / file).write_text(content)
-        files = {"key_frames": work / name / str(sequence.simulation["key_frames"])}
-        settings = SimulationSettings(scene=str(work / name / str(sequence.scene)), **{**sequence.simulation, **files})
-    simulate(settings, work / name / "simulated")
-    convert_recording(work / name / "simulated", folder)
+        given = {**sequence.simulation, "key_frames": work / name / str(sequence.simulation["key_frames"])}
+        settings = SimulationSettings(str(work / name / str(sequence.scene)), layout="event_recording", **given)
+    simulate(settings, folder)
     return folder
 
 
@@ -190,8 +191,6 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     name, seed = cell["recording"], cell["seed"]
     right = right_poses(name, work)
     folder = work / name / f"{cell['fault']}-{seed}"
-    if not (folder / "poses.txt").exists():
-        made_wrong(right, folder, FAULTS[cell["fault"]], seed)
     changes = {
         "machine.seed": seed,
         "max_num_iterations": cell["steps"],

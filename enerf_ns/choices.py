@@ -416,44 +416,63 @@ class _Resolver:
         kept = [part for part in parts if self._value(f"poses.refine_{part}") is not False]
         starts = refines and self.use_events and poses.clock_ms is None and poses.refine_clock is not False
         found = clock_and_lens(recording, self._distance) if starts or "lens" in kept else None
-        clock, late, scale, words = 0.0, 0.0, 1.0, []
+        clock, late, scale = 0.0, 0.0, 1.0
+        words: dict[str, list[str]] = {"clock": [], "lens": []}
         if found is not None:
             delay, lens = found
             if starts and delay.is_told:
                 has_frames = recording.has_frames and not recording.reconstructed_by
                 frames = clock_of_frames(recording, (self._distance, self._distance)) if has_frames else None
+                if frames is not None and frames.is_told:
+                    lag = min(frames.value, 0.0)
+                    if abs(delay.value - frames.value) < 2.0 * delay.error:
+                        delay = frames  # on one clock, which frames tell better
+                else:
+                    lag = min(delay.value, 0.0)
                 if frames is not None and not _is_wrong(frames, 0.0, SMALLEST_DELAY):
                     frames = None
-                if frames is not None and abs(delay.value - frames.value) < 2.0 * delay.error:
-                    delay = frames  # on one clock, which frames tell better
-                lag = min(delay.value if frames is None else frames.value, 0.0)
                 if self._value("model.sensor.learn_cutoff_frequency") and -LARGEST_LAG_MS < lag < 0.0:
-                    words.append(f"{-lag:.2f} ms by which events are late are left to the lag of the pixels")
+                    words["clock"].append(f"{-lag:.2f} ms by which events are late are left to the lag of the pixels")
                     delay = replace(delay, value=delay.value - lag)
                     frames = None
                 if frames is not None:
                     late = frames.value
-                    words.append(f"frames are stamped {late:+.2f} ± {frames.error:.2f} ms late")
+                    words["clock"].append(f"frames are stamped {late:+.2f} ± {frames.error:.2f} ms late")
                 if _is_wrong(delay, 0.0, SMALLEST_DELAY):
                     clock = delay.value
-                    words.append(f"poses are stamped {clock:+.2f} ± {delay.error:.2f} ms late")
+                    words["clock"].append(f"poses are stamped {clock:+.2f} ± {delay.error:.2f} ms late")
             turns = poses.refine_lens or turns_about_two_axes(recording.trajectory)
             if "lens" in kept and turns and _is_wrong(lens, 1.0, SMALLEST_SCALE):
                 scale = lens.value
-                words.append(f"the focal length is {scale:.3f} ± {lens.error:.3f} of the stated one")
+                words["lens"].append(f"the focal length is {scale:.3f} ± {lens.error:.3f} of the stated one")
         clock = self.use("poses.clock_ms", lambda: clock)
         late = self.use("poses.frame_delay_ms", lambda: late)
         scale = self.use("poses.focal_scale", lambda: scale)
-        value = f"{', '.join(kept)}, where events show that they are wrong" if kept else "as they are stated"
-        why = f"sharpest events: {'; '.join(words)}" if words else "events are sharpest about as they are stated"
-        if found is None:
-            why = "too little is known before training" if kept else "set by flag"
-        if is_blind and not kept:
-            why += "; pixels are blind after events, which hides what else is wrong"
-        if not refines or not self.use_events:
-            why = "not part of the method" if self.use_events else "learns from frames alone"
-        self.row("refined poses", bool(kept), value, why, "poses.refine_clock")
+        self._say_refined(kept, words, is_blind)
         self._posed = Corrections(delay=clock, frame_delay=late, focal_scale=scale).recording(recording)
+
+    def _say_refined(self, kept: list[str], found: dict[str, list[str]], is_blind: bool) -> None:
+        """A row for each thing that may be wrong with the poses, and whether it is corrected.
+
+        Args:
+            kept: What is corrected where events show that it is wrong.
+            found: What the sharpest events say of it before training.
+            is_blind: Whether pixels are blind after events.
+        """
+        names = {"clock": "clock of the poses", "mount": "mount", "lens": "lens", "drift": "drift of the poses"}
+        for part, name in names.items():
+            setting = f"poses.refine_{part}"
+            why = "; ".join(found.get(part, [])) or "events are compared with what is rendered of them"
+            if part not in kept:
+                why = "; ".join(found.get(part, [])) or "taken as it is stated"
+                if is_blind:
+                    why += "; pixels are blind after events, which hides what else is wrong"
+            if getattr(self.config.poses, f"refine_{part}") is not None:
+                why = "set by flag"
+            elif not self.config.defaults.refines_poses or not self.use_events:
+                why = "not part of the method" if self.use_events else "learns from frames alone"
+            value = "corrected where events show that it is wrong" if part in kept else ""
+            self.row(name, part in kept, value, why, setting)
 
     def _events(self) -> None:
         """Which pairs are drawn."""

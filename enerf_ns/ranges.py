@@ -113,6 +113,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "interlevel_loss_weight": WEIGHT,
     "near_plane": (0.0, 1e3),
     "init_density": (1e-6, 1e6),
+    "clock_ms": (-100.0, 100.0),  # of which more is another recording's
+    "frame_delay_ms": (-100.0, 100.0),
+    "focal_scale": (0.8, 1.2),
 }
 """Lowest and highest value of each number, or of each of some numbers, by the name of its field in the config."""
 
@@ -196,6 +199,8 @@ def _flag(path: tuple[str, ...]) -> str:
         return "event-data --" + path[-1].replace("_", "-")
     if path[:3] == ("pipeline", "model", "sensor"):
         path = (*path[:2], *path[3:])
+    if path[:2] == ("pipeline", "poses"):
+        path = (path[0], *path[2:])
     return "--" + ".".join(path).replace("_", "-")
 
 

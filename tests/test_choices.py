@@ -401,6 +401,11 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
     """The flag of each row is one of the config; set to each answer, the row says so and that a flag did it."""
     forced: dict[str, tuple[Any, Any]] = {
         "pose gaps": (True, False),
+        "noise of poses": (True, False),
+        "clock of the poses": (True, False),
+        "mount": (True, False),
+        "lens": (True, False),
+        "drift of the poses": (True, False),
         "held-out events": (0.1, 0.0),
         "event loss": ("events", "frames"),
         "silent pixels": (7, 0),
@@ -439,6 +444,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
                 owner = getattr(owner, parent)
             field = name.replace("-", "_")
             owner = config.model.sensor if hasattr(config.model.sensor, field) else owner
+            owner = config.poses if hasattr(config.poses, field) else owner
             assert hasattr(owner, field)
             setattr(owner, field, value)
             row = rows(resolve(config, distorted)).get(part)

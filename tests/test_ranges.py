@@ -86,7 +86,8 @@ class Setting:
             return dotted  # which no flag sets
         if dotted.startswith("pipeline.datamanager.dataparser."):
             return "event-data --" + self.path[-1].replace("_", "-")
-        return "--" + dotted.replace("model.sensor.", "model.").replace("_", "-")
+        dotted = dotted.replace("model.sensor.", "model.").replace("pipeline.poses.", "pipeline.")
+        return "--" + dotted.replace("_", "-")
 
 
 def numbers(kind: Any) -> tuple[type, int | None] | None:

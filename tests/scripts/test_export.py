@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 from small_runs import SMALL
 
 from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.evaluation.runs import load, method_config, train
 from enerf_ns.export import surface
+from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.export import Export
 
 
@@ -53,7 +57,7 @@ def test_a_reference_takes_the_place_of_the_simulated_scene(run: Path, tmp_path:
 
 
 def test_mistakes_are_sentences_and_leave_nothing(run: Path, recording: Path, tmp_path: Path):
-    with pytest.raises(FlagError, match=r"neither \.ply nor \.glb"):
+    with pytest.raises(FlagError, match=r"does not end with \.ply or \.glb"):
         Export("mesh", run, tmp_path / "mesh.obj").main()
     with pytest.raises(FlagError, match="--voxel"):
         Export("mesh", run, tmp_path / "mesh.ply", voxel=-1.0).main()
@@ -78,3 +82,41 @@ def test_a_place_that_cannot_be_written_to_is_a_sentence(run: Path, tmp_path: Pa
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot be written"):
         Export("pointcloud", run, tmp_path / "file" / "points.ply", voxel=0.1).main()
+
+
+def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, tmp_path: Path):
+    """As TUM text, of which NumPy reads the trajectory on the clock of the events; with a lens that OpenCV takes."""
+    pipeline = load(run / "config.yml").pipeline
+    given = pipeline.datamanager.recording
+    assert pipeline.poses is not None
+    pipeline.poses.is_corrected[0], pipeline.poses.value[0] = True, 0.25  # 5 ms
+    (checkpoint,) = run.glob("nerfstudio_models/*.ckpt")
+    kept = checkpoint.read_bytes()
+    stored = torch.load(checkpoint, weights_only=False)
+    stored["pipeline"] |= {f"poses.{name}": value for name, value in pipeline.poses.state_dict().items()}
+    torch.save(stored, checkpoint)
+    try:
+        Export("poses", run, tmp_path / "poses.txt").main()
+        Convert(recording, tmp_path / "new", run=run).main()
+    finally:
+        checkpoint.write_bytes(kept)
+
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    times = np.round(rows[:, 0] * 1e9).astype(np.int64)
+    inside = (times > times[0] + 10_000_000) & (times < times[-1] - 20_000_000)
+    assert inside.sum() > 5
+    expected = given.trajectory.poses(torch.from_numpy(times[inside] + 5_000_000)).numpy()
+    np.testing.assert_allclose(rows[inside, 1:4], expected[:, :, 3], atol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(rows[inside, 4:]).as_matrix(), expected[:, :, :3], atol=1e-6)
+    camera = json.loads((tmp_path / "poses.json").read_text())
+    assert camera["fx"] == given.camera.fx
+    assert [row["is_corrected"] for row in camera["corrections"]] == [True, False, False, False, False]
+    again = read_recording(tmp_path / "new").trajectory
+    np.testing.assert_allclose(again.poses(torch.from_numpy(times[inside])).numpy(), expected, atol=1e-6)
+
+
+def test_flags_of_meshes_are_none_of_poses(run: Path, tmp_path: Path):
+    with pytest.raises(FlagError, match="--voxel is for meshes"):
+        Export("poses", run, tmp_path / "poses.txt", voxel=0.1).main()
+    with pytest.raises(FlagError, match=r"does not end with \.txt"):
+        Export("poses", run, tmp_path / "poses.ply").main()
