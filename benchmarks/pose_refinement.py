@@ -66,7 +66,7 @@ def main() -> None:
     done = [json.loads(line) for line in arguments.output.read_text().splitlines()] if arguments.output.exists() else []
     keys = ("recording", "fault", "row", "seed", "steps")
     known = {tuple(result[key] for key in keys) for result in done}
-    cells = [
+    cells: list[dict[str, Any]] = [
         dict(zip(keys, cell, strict=True))
         for seed in range(arguments.seeds)
         for fault in arguments.faults
@@ -230,7 +230,7 @@ def errors(true: Any, other: Any) -> tuple[float, float]:
     times = torch.from_numpy(np.linspace(first, last, 400).astype(np.int64))
     right, found = (one.poses(times).numpy() for one in (true, other))
     centred = [poses[:, :, 3] - poses[:, :, 3].mean(axis=0) for poses in (right, found)]
-    turn, _ = Rotation.align_vectors(centred[0], centred[1])
+    turn = Rotation.align_vectors(centred[0], centred[1])[0]
     off = centred[0] - turn.apply(centred[1])
     turns = Rotation.from_matrix(right[:, :, :3].transpose(0, 2, 1) @ found[:, :, :3])
     left = (turns.mean().inv() * turns).as_rotvec()

@@ -270,7 +270,8 @@ class EnerfPipeline(VanillaPipeline):
                 camera.scale,
             )
         with torch.no_grad():
-            change = brightness_change(*rgb.chunk(2), some, sensor) / unit
+            start, end = rgb.chunk(2)
+            change = brightness_change(start, end, some, sensor) / unit
             residual = sensor.measured_change(some) / unit - change
             others = torch.stack([change, (some.on + some.off).float(), 1e-9 * (some.end - some.start).float()], dim=1)
             lags = torch.zeros(2, len(some), 2)  # the clock is told only as far as these do not explain the same

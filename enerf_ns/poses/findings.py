@@ -109,4 +109,4 @@ def picture_shift(recording: EventRecording, first: Corrections, second: Correct
     world = before[:, None, :, 3] + distance * seen @ before[:, :, :3].transpose(0, 2, 1)
     there = (world - after[:, None, :, 3]) @ after[:, :, :3]
     apart: Float64[np.ndarray, "times places 2"] = there[..., :2] / there[..., 2:].clip(min=1e-9) - now[:, :2]
-    return float(np.sqrt((([camera.fx, camera.fy] * apart) ** 2).sum(axis=-1).mean()))
+    return float(np.sqrt(((np.array([camera.fx, camera.fy]) * apart) ** 2).sum(axis=-1).mean()))

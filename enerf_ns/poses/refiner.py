@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, Optional
+from typing import TYPE_CHECKING, Optional
 
 import numpy as np
 import torch
@@ -26,7 +26,8 @@ from enerf_ns.poses.corrections import Corrections, DriftBasis
 if TYPE_CHECKING:
     from enerf_ns.enerf_model import EnerfModel
 
-Part = Literal["clock", "rotation", "translation", "lens", "drift"]
+Part = str
+"""Something that may be wrong: clock, rotation (of the mount), translation (of it), lens, or drift."""
 
 UNITS: dict[Part, float] = {
     "clock": 20.0,

@@ -103,7 +103,7 @@ def looks(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float, number: in
         times = random.integers(0, SPAN, (2, 256))
         pixels = random.integers(0, CAMERA.width * CAMERA.height, 256)
         bends = random.normal(size=(512, 3 * NUM_SHAPES))
-        slopes = Slopes(*(200.0 * random.normal(size=(512, 3)) for _ in range(3)), bends)
+        slopes = Slopes(*200.0 * random.normal(size=(3, 512, 3)), bends=bends)
         others, lags = random.normal(size=(256, 3)), np.zeros((2, 256, 2))
         twists = np.concatenate([slopes.shifts, slopes.turns], axis=1)
         columns = refiner._columns(twists, slopes, times.reshape(-1), np.tile(pixels, 2))
@@ -173,9 +173,8 @@ def test_what_the_scene_can_take_up_is_not_taken_for_a_wrong_pose():
     random = np.random.default_rng(0)
     bend = 0.02 * random.normal(size=3 * NUM_SHAPES)
     for _ in range(60):
-        slopes = Slopes(
-            *(random.normal(size=(512, 3)) for _ in range(3)), 50.0 * random.normal(size=(512, 3 * NUM_SHAPES))
-        )
+        bends = 50.0 * random.normal(size=(512, 3 * NUM_SHAPES))
+        slopes = Slopes(*random.normal(size=(3, 512, 3)), bends=bends)
         bent = slopes.bends @ bend
         residual = bent[256:] - bent[:256] + 0.1 * random.normal(size=256)
         times, pixels = random.integers(0, SPAN, (2, 256)), random.integers(0, 3072, 256)

@@ -20,7 +20,8 @@ def test_what_is_fitted_is_the_most_likely_where_nobody_knows_the_noise(noise_of
             len(measured) * float(square.log()) for measured, square in zip((events, frames), squares, strict=True)
         )
 
-    expected = minimize_scalar(unlikelihood, bounds=(0.5, 1.7), method="bounded").x
+    found: Any = minimize_scalar(unlikelihood, bounds=(0.5, 1.7), method="bounded")
+    expected = found.x
 
     value, balance = torch.tensor(1.1, dtype=torch.float64, requires_grad=True), ErrorBalance()
     for _ in range(3000):
