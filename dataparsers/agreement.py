@@ -367,7 +367,7 @@ class Agreement:
         yield Problem(
             f"The clocks disagree by {apart:.1f} ± {error:.1f} ms, in which the picture moves by "
             f"{self.pixels(apart):.1f} pixels: {clocks} against the events of the same instant.",
-            f"{advice}, or look for what delays them.",
+            f"{advice}, or look for what delays them. Training with enerf corrects a clock by itself.",
         )
 
     def _focal_problems(self) -> Iterator[Problem]:

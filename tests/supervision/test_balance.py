@@ -1,5 +1,7 @@
 """The weight of frames beside events against the likelihood that it comes from."""
 
+from typing import Any
+
 import pytest
 import torch
 from scipy.optimize import minimize_scalar
