@@ -222,8 +222,9 @@ def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
 
 
 def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
-    """An image with three channels, equal ones where it is grey [height, width]."""
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+    """An image with three channels, equal ones where it is grey: [height, width], or with one channel."""
+    image = image if image.ndim == 3 else image[..., None]
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
 
 def check_image_size(path: Path, width: int, height: int) -> None:

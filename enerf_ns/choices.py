@@ -411,7 +411,8 @@ class _Resolver:
         for part in parts:
             stated = {"clock": poses.clock_ms, "lens": poses.focal_scale}.get(part)
             refined = getattr(poses, f"refine_{part}")
-            if refined is None and (stated is not None or not refines or not self.use_events or is_blind):
+            given = part == "lens" and self.use_frames  # whose pictures are undistorted once
+            if refined is None and (stated is not None or not refines or not self.use_events or is_blind or given):
                 self.values[f"poses.refine_{part}"] = False
         kept = [part for part in parts if self._value(f"poses.refine_{part}") is not False]
         starts = refines and self.use_events and poses.clock_ms is None and poses.refine_clock is not False

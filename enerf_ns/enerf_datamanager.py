@@ -359,10 +359,15 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     def correct(self, corrections: Corrections) -> None:
         """Has rays follow corrected poses, and through a corrected lens, and the cameras of frames too."""
+        made = ["event_camera", "event_camera_without_distortion", "frame_camera"]
+        if corrections.distortion != self.corrections.distortion:
+            made.append("frame_colours")  # which are undistorted
         self.corrections = corrections
         for dataset in (self.train_dataset, self.eval_dataset):
             dataset.correct(corrections)
-        for name in ("event_camera", "event_camera_without_distortion", "frame_camera"):
+        for loader in (self.fixed_indices_eval_dataloader, self.eval_dataloader):
+            loader.cameras = self.eval_dataset.cameras.to(self.device)
+        for name in made:
             self.__dict__.pop(name, None)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:

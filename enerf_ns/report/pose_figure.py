@@ -48,7 +48,7 @@ def corrections_over_time(recording: EventRecording) -> Figure | None:
         for number, name in enumerate(("x, right", "y, down", "z, forward")):
             axis.plot(seconds, values[:, number], color=COLOURS[number], label=name)
         axis.set_ylabel(label)
-    others[0].legend(frameon=False, ncols=3)
+    others[0].legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     others[1].sharex(others[0])
     others[1].set_xlabel("time, s")
     for axis in (path, *others):
