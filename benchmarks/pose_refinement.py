@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -199,6 +200,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     }
     config = method_config("enerf", folder, work / "runs", changes)
     config.timestamp = "-".join(str(value) for value in cell.values())
+    shutil.rmtree(config.get_base_dir(), ignore_errors=True)  # of a training that was broken off
     with redirect_stdout(sys.stderr):
         run = train(config)
         views, _ = held_out_views(run.pipeline)

@@ -152,9 +152,10 @@ what it sees."""
 LARGEST_NOISE = 0.1
 """Pixels by which noise of the poses may move the picture before it is taken off."""
 
-SMALLEST_DELAY, SMALLEST_SCALE = 0.5, 0.02
-"""Delay (ms) of the poses, and share of the focal length, from which on refinement starts there; less it finds
-itself."""
+SMALLEST_DELAY, SMALLEST_SCALE = 2.0, 0.06
+"""Delay (ms) of a clock, and share of the focal length, from which on refinement starts there; less it finds itself.
+On simulated recordings that are right, sharpest events are off by up to 1.1 ms and 4.5 %, several times their standard
+errors."""
 
 
 class PipelineConfig(Protocol):

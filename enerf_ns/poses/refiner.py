@@ -39,7 +39,7 @@ UNITS: dict[Part, float] = {
 """How large each number may be expected to be: its unit here, and the standard deviation of what is known of it
 beforehand. Milliseconds, radians, metres, shares."""
 
-STARTS_WITHIN: dict[Part, float] = {"clock": 0.5, "lens": 0.005}
+STARTS_WITHIN: dict[Part, float] = {"clock": 1.0, "lens": 0.03}
 """Milliseconds, and share of the focal length, within which what it starts from is right: standard deviation."""
 
 DISTORTION_UNITS = 0.02, 0.2
