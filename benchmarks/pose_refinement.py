@@ -254,9 +254,9 @@ def table(results: list[dict[str, Any]]) -> str:
         "trajectory, mm", "refined", "degrees", "refined", "clock, ms", "focal length", "time refined / fixed",
     )  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
-    for (recording, fault), rows in cells.items():
-        fixed, refined = rows["fixed"], rows["refined"]
-        right = cells[recording, "none"]["fixed"]
+    for (recording, fault), rows in sorted(cells.items(), key=lambda cell: (cell[0][0], [*FAULTS].index(cell[0][1]))):
+        fixed, refined = rows.get("fixed", []), rows.get("refined", [])
+        right = cells.get((recording, "none"), {}).get("fixed", [])
         numbers = [
             recording,
             fault,
