@@ -365,8 +365,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         self.corrections = corrections
         for dataset in (self.train_dataset, self.eval_dataset):
             dataset.correct(corrections)
-        for loader in (self.fixed_indices_eval_dataloader, self.eval_dataloader):
-            loader.cameras = self.eval_dataset.cameras.to(self.device)
+        for name in ("fixed_indices_eval_dataloader", "eval_dataloader"):  # which are not there to render alone
+            if loader := getattr(self, name, None):
+                loader.cameras = self.eval_dataset.cameras.to(self.device)
         for name in made:
             self.__dict__.pop(name, None)
 
