@@ -48,7 +48,7 @@ DISTORTION_UNITS = 0.02, 0.2
 DRIFT_UNITS = np.array([0.01] * 3 + [math.radians(0.5)] * 3)
 """The same of the coefficients of the drift."""
 
-PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = float(__import__("os").environ.get("PIECE", 0.2)), 6, 60
+PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = 0.2, 6, 60
 """Length (s) of the pieces of a drift, and their fewest and most number."""
 
 FIRST_STEP = 50
@@ -74,7 +74,7 @@ SURE, STAYS = 9.0, 3.0
 """By how much the squared error, in units of its variance, must fall beyond what chance explains before something is
 corrected, and for it to stay so."""
 
-SYSTEMATIC = float(__import__("os").environ.get("SYS", 0.02))
+SYSTEMATIC = 0.02
 """Pixels by which what is rendered may be off as a whole in any one way, however much was seen: standard deviation."""
 
 SETTLED_AFTER = 200.0
