@@ -450,31 +450,37 @@ class _Resolver:
         clock = self.use("poses.clock_ms", lambda: clock)
         late = self.use("poses.frame_delay_ms", lambda: late)
         scale = self.use("poses.focal_scale", lambda: scale)
-        self._say_refined(kept, words, is_blind)
+        self._say_refined(kept, words, {"clock": bool(clock or late), "lens": scale != 1.0}, is_blind)
         self._posed = Corrections(delay=clock, frame_delay=late, focal_scale=scale).recording(recording)
 
-    def _say_refined(self, kept: list[str], found: dict[str, list[str]], is_blind: bool) -> None:
+    def _say_refined(
+        self, kept: list[str], found: dict[str, list[str]], starts: dict[str, bool], is_blind: bool
+    ) -> None:
         """A row for each thing that may be wrong with the poses, and whether it is corrected.
 
         Args:
             kept: What is corrected where events show that it is wrong.
             found: What the sharpest events say of it before training.
+            starts: Whether it is corrected before training.
             is_blind: Whether pixels are blind after events.
         """
+        poses = self.config.poses
         names = {"clock": "clock of the poses", "mount": "mount", "lens": "lens", "drift": "drift of the poses"}
+        stated = {"clock": (poses.clock_ms, poses.frame_delay_ms), "lens": (poses.focal_scale,)}
         for part, name in names.items():
             setting = f"poses.refine_{part}"
-            why = "; ".join(found.get(part, [])) or "events are compared with what is rendered of them"
-            if part not in kept:
-                why = "; ".join(found.get(part, [])) or "taken as it is stated"
-                if is_blind:
-                    why += "; pixels are blind after events, which hides what else is wrong"
-            if getattr(self.config.poses, f"refine_{part}") is not None:
+            value = "corrected before training" * starts.get(part, False)
+            why = "events are compared with what is rendered of them" if part in kept else "taken as it is stated"
+            why = "; ".join(found.get(part, [])) or why
+            if part in kept:
+                value = "corrected where events show that it is wrong"
+            elif is_blind:
+                why += "; pixels are blind after events, which hides what else is wrong"
+            if any(flag is not None for flag in (getattr(poses, f"refine_{part}"), *stated.get(part, ()))):
                 why = "set by flag"
             elif not self.config.defaults.refines_poses or not self.use_events:
                 why = "not part of the method" if self.use_events else "learns from frames alone"
-            value = "corrected where events show that it is wrong" if part in kept else ""
-            self.row(name, part in kept, value, why, setting)
+            self.row(name, bool(value), value, why, setting)
 
     def _events(self) -> None:
         """Which pairs are drawn."""

@@ -15,6 +15,9 @@ from enerf_ns.dataparsers.problems import find_problems
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.poses.findings import Finding
 
+PREFIX = "--pipeline."
+"""What flags begin with, said once below a table."""
+
 
 def recording_table(parser: EventDataParserConfig) -> Table:
     """What a recording holds, and where its scene is taken to lie."""
@@ -57,28 +60,31 @@ def recording_table(parser: EventDataParserConfig) -> Table:
 
 def choices_table(choices: Sequence[Choice]) -> Table:
     """What is kept and what is left out, why, and by which flag it is forced."""
-    prefix = "--pipeline."
-    table = Table(title="Parts of the method", caption=f"forced by {prefix}FLAG VALUE, those of event-data at the end")
-    table.title_justify = table.caption_justify = "left"
-    for column in ("part", "", "what", "why", "flag"):
-        table.add_column(column, overflow="fold")
+    caption = f"forced by {PREFIX}FLAG VALUE, those of event-data at the end"
+    table = _table("Parts of the method", caption, ("part", "", "what", "why", "flag"))
     for choice in choices:
         kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
-        flag = Text(choice.flag.removeprefix(prefix), "dim")
+        flag = Text(choice.flag.removeprefix(PREFIX), "dim")
         table.add_row(choice.part, kept, Text(choice.value), Text(choice.why), flag)
     return table
 
 
 def findings_table(found: Sequence[Finding]) -> Table:
     """What was found to be wrong with clock, poses and lens, and by how much that moves the picture."""
-    prefix = "--pipeline."
-    table = Table(title="Clock, poses and lens", caption=f"forced or forbidden by {prefix}FLAG True or False")
-    table.title_justify = table.caption_justify = "left"
-    for column in ("part", "", "found", "moves the picture by", "flag"):
-        table.add_column(column, overflow="fold")
+    caption = f"forced or forbidden by {PREFIX}FLAG True or False"
+    table = _table("Clock, poses and lens", caption, ("part", "", "found", "moves the picture by", "flag"))
     for row in found:
         kept = "[green]corrected[/green]" if row.is_corrected else "[dim]as stated[/dim]"
         value = row.value if row.is_told else f"not told ({row.value})"
         moved = f"{row.pixels:.2g} pixels" if row.is_corrected else ""
-        table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(prefix), "dim"))
+        table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(PREFIX), "dim"))
+    return table
+
+
+def _table(title: str, caption: str, columns: Sequence[str]) -> Table:
+    """An empty table whose cells may go over several lines."""
+    table = Table(title=title, caption=caption)
+    table.title_justify = table.caption_justify = "left"
+    for column in columns:
+        table.add_column(column, overflow="fold")
     return table

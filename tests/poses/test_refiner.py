@@ -183,6 +183,16 @@ def test_what_the_scene_can_take_up_is_not_taken_for_a_wrong_pose():
     assert not refiner.solve(400)
 
 
+def test_what_turns_out_to_be_right_is_taken_back_at_once():
+    """Though corrections grow a step at a time."""
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    refiner.is_corrected[0], refiner.value[0] = True, 1.5
+    assert refiner.corrected == ["clock"] and refiner.corrections.delay == 30.0
+    looks(refiner, {"clock": [-30.0]}, 0.3)
+    assert refiner.solve(400)
+    assert refiner.corrected == [] and refiner.corrections.delay == 0.0
+
+
 def test_flags_force_and_forbid():
     refiner = PoseRefiner(RefinerConfig(refine_clock=False, refine_lens=True), recording())
     assert refiner.corrected == ["lens"] and "clock" not in refiner.allowed
@@ -205,7 +215,7 @@ def test_a_camera_that_turns_about_one_axis_tells_neither_mount_nor_lens():
 
 def test_what_no_recording_is_wrong_by_is_an_error():
     refiner = PoseRefiner(RefinerConfig(), recording())
-    with pytest.raises(RecordingError, match="clock would have to be corrected by more than 100"):
+    with pytest.raises(RecordingError, match="clock of the poses would have to be corrected by more than 100 ms"):
         for number in range(40):
             looks(refiner, {"clock": [60.0]}, 0.3, 6, number)
             refiner.solve(400)
@@ -268,3 +278,9 @@ def test_a_training_finds_the_clock(simulated: EventRecording, tmp_path: Path, d
     assert refiner is not None
     assert refiner.corrected == (["clock"] if delay else [])
     assert refiner.corrections.delay == pytest.approx(delay, abs=0.3)
+    if not delay:  # where nothing is wrong, nothing changes
+        parts = {f"pipeline.poses.refine_{part}": False for part in ("clock", "mount", "lens", "drift")}
+        changes = {"max_num_iterations": 400, "evaluation_share": 0.0, **parts}
+        without = train(method_config("enerf", folder, tmp_path / "without", changes))
+        weights, same = (one.pipeline.model.field.state_dict() for one in (run, without))
+        assert all(torch.equal(weights[name], same[name]) for name in same)
