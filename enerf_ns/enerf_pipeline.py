@@ -249,6 +249,8 @@ class EnerfPipeline(VanillaPipeline):
         """Has the poses corrected, now and then, by what pairs of a training step tell."""
         may_begin = step < BEGINS_UNTIL * self.num_steps
         every = LOOK_AGAIN_EVERY if refiner.corrected and may_begin else LOOK_EVERY
+        if not (refiner.corrected or may_begin):
+            return  # nothing is, or will be
         if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
