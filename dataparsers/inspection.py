@@ -110,6 +110,8 @@ class Inspection:
     """What events and frames say about the sensor."""
     agreement: Agreement | None = None
     """What the events say about clocks, poses and focal length; None where they are too few to say anything."""
+    as_stated: Agreement | None = None
+    """The same of what was stated, where the recording is one that was refined."""
 
     @classmethod
     def of(cls, recording: EventRecording) -> Inspection:
@@ -127,7 +129,9 @@ class Inspection:
         agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
         problems = [*(agreement.problems() if agreement else []), *sensor.problems()]
         problems += [*find_problems(recording, near_far), *unknown]
-        return cls(recording, statistics, near_far, problems, sensor, agreement)
+        as_read = recording.as_read
+        as_stated = None if as_read is None else Agreement.of(as_read, near_far)
+        return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated)
 
     def print_tables(self, console: Console) -> None:
         """What was found, numbers, and problems in red, on the terminal."""
@@ -206,7 +210,9 @@ class Inspection:
 
     def focus(self) -> dict[str, str]:
         """What events say about clocks, poses and focal length, by name; empty where they are too few."""
-        return self.agreement.rows() if self.agreement else {}
+        rows = self.agreement.rows() if self.agreement else {}
+        stated = self.as_stated.rows() if self.as_stated else {}
+        return rows | {f"{name}, as stated": value for name, value in stated.items() if value != rows.get(name)}
 
     def _tables(self) -> list[tuple[str, dict[str, str]]]:
         tables = [
@@ -217,8 +223,12 @@ class Inspection:
         ]
         return [(title, rows) for title, rows in tables if rows]
 
-    def page(self) -> str:
-        """One HTML file with all pictures in it, which loads nothing."""
+    def page(self, corrections: Figure | None = None) -> str:
+        """One HTML file with all pictures in it, which loads nothing.
+
+        Args:
+            corrections: What was refined of the trajectory, over time.
+        """
         return fill_page(
             Path(__file__).with_name("inspection.html"),
             name=self.recording.path.name,
@@ -236,6 +246,7 @@ class Inspection:
             overlays=self._overlays(),
             warped=self._warped(),
             has_frames=self._frames is not None,
+            corrections=_plot(corrections) if corrections else None,
             timeline=_plot(self.timeline()),
             instants=self._instants(),
             trajectory=_plot(self.trajectory()),

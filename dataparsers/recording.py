@@ -260,6 +260,9 @@ class EventRecording:
     """Whether instants within the gaps of the trajectory are used."""
     as_read: EventRecording | None = None
     """The recording as it was read, of one whose poses or camera were refined: the events are the same."""
+    pose_noise_taken_off: tuple[float, float] | None = None
+    """Standard deviations along and about an axis, metres and radians, of the noise that was taken off the poses. None:
+    they were not smoothed."""
     event_file_states: tuple[tuple[str, int, int, int], ...] = ()
     """Path, size in bytes, and times of modification and of change (ns) of each of `event_files` when they were looked
     at; taken here unless given."""
@@ -495,21 +498,25 @@ def _with_selection(
 
 @cache
 def _with_smooth_poses(recording: EventRecording) -> EventRecording:
-    smooth = {id(recording.trajectory): _smooth(recording.trajectory)}
+    noise = pose_noise(recording.trajectory)
+    if noise is None:
+        return recording
+    smooth = {id(recording.trajectory): noise.smooth}
 
     def of(frames: Frames | None) -> Frames | None:
         if frames is None:
             return None
-        found = smooth.setdefault(id(frames.trajectory), _smooth(frames.trajectory))
-        return replace(frames, trajectory=found)
+        own = frames.trajectory
+        if id(own) not in smooth:
+            found = pose_noise(own)
+            smooth[id(own)] = own if found is None else found.smooth
+        return replace(frames, trajectory=smooth[id(own)])
 
     frames, blurred = of(recording.frames), of(recording.blurred_frames)
-    return replace(recording, trajectory=smooth[id(recording.trajectory)], frames=frames, blurred_frames=blurred)
-
-
-def _smooth(trajectory: Trajectory) -> Trajectory:
-    noise = pose_noise(trajectory)
-    return trajectory if noise is None else noise.smooth
+    taken_off = noise.position, noise.rotation
+    return replace(
+        recording, trajectory=noise.smooth, frames=frames, blurred_frames=blurred, pose_noise_taken_off=taken_off
+    )
 
 
 @cache

@@ -401,6 +401,7 @@ class _Resolver:
             return
         pixels = noise.pixels(self.recording.camera.fx, self._distance)
         value = f"{1e3 * noise.position:.2g} mm and {math.degrees(noise.rotation):.2g} degrees are taken off"
+        value += "; what that leaves is refined" * (self.config.poses.refine_drift is not False)
         why = f"it moves the picture by {pixels:.2g} pixels"
         self.row("noise of poses", smooth, value * smooth, self.why(name, why), name)
 

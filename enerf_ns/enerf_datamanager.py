@@ -111,6 +111,10 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     seen in the middle. None: as many as the motion needs, where the exposures are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
+    corrections: Fixed[Optional[Corrections]] = None  # noqa: UP045
+    """What a loaded run corrects of the poses: for data managers that are made of its configuration later, as by
+    `ns-render dataset`."""
+
     # What Nerfstudio's own data manager has, and this one has no use for, is no flag.
     masks_on_gpu: Fixed[bool] = False
     images_on_gpu: Fixed[bool] = False
@@ -140,6 +144,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def __init__(self, config: EnerfDataManagerConfig, *args: Any, **kwargs: Any):
         config = replace(config, dataparser=replace(config.dataparser, picture_files=False))
         super().__init__(config, *args, **kwargs)
+        if config.corrections is not None:
+            self.correct(config.corrections)
 
     def get_datapath(self) -> Path:
         """Where `ns-viewer` keeps camera paths: not with the recording, which is only read."""

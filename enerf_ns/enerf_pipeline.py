@@ -300,6 +300,8 @@ class EnerfPipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         super().load_pipeline(loaded_state, step)
         self._correct_poses()
+        if self.poses is not None:
+            self.config.datamanager.corrections = self.poses.corrections
 
     @torch.no_grad()
     def _slopes(self, batch: EventBatch, number: int) -> Float[Tensor, "pairs 2"]:

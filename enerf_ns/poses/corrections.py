@@ -55,15 +55,29 @@ class DriftBasis:
 
 
 @dataclass(frozen=True, eq=False)
+class Drift:
+    """Shifts and rotations of a camera, in its own axes, that change with time."""
+
+    basis: DriftBasis
+    coefficients: Float64[np.ndarray, "functions 6"]
+    """Of shifts in metres, and of rotation vectors in radians."""
+
+    def at(self, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 6"]:
+        """Shifts (metres) and rotation vectors at some times, ns."""
+        return self.basis.at(times) @ self.coefficients
+
+
+@dataclass(frozen=True, eq=False)
 class Corrections:
     """By what clocks, poses and lens of a recording are wrong.
 
-    The camera of the events has at time t the pose T(t + delay) Exp(mount) Exp(drift(t)), where T is the given
-    trajectory; in the axes of the camera, shift and rotation apart, as `PosedCamera.rays` has corrections.
+    The camera of the events has at time t the pose T(t + delay(t)) Exp(mount) Exp(drift(t)) Exp(noise(t)), where T is
+    the given trajectory; in the axes of the camera, shift and rotation apart, as `PosedCamera.rays` has corrections.
     """
 
     delay: float = 0.0
-    """Milliseconds by which the given poses are stamped later than events of the same instant."""
+    """Milliseconds by which the given poses are stamped later than events of the same instant, in the middle of the
+    poses."""
     frame_delay: float = 0.0
     """Milliseconds by which frames are stamped later than events of the same instant."""
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -74,27 +88,34 @@ class Corrections:
     """The focal length as a multiple of the stated one."""
     distortion: float = 0.0
     """What the first coefficient of radial distortion is more than stated."""
-    basis: DriftBasis | None = None
-    drift: Float64[np.ndarray, "functions 6"] | None = None
-    """Coefficients of the drift, of shifts in metres and of rotation vectors in radians. None: there is none."""
+    delay_rate: float = 0.0
+    """Milliseconds by which the delay of the poses grows in a second."""
+    drift: Drift | None = None
+    """What changes slowly. None: nothing."""
+    noise: Drift | None = None
+    """What smoothing has left of the noise of the poses. None: nothing."""
     _made: tuple[Trajectory, Trajectory] | None = field(default=None, init=False, repr=False)
 
     @property
     def moves_poses(self) -> bool:
         """Whether poses of the camera of the events are others than those given."""
-        return self.delay != 0.0 or any(self.rotation) or any(self.translation) or self.drift is not None
+        clock = self.delay != 0.0 or self.delay_rate != 0.0
+        mount = any(self.rotation) or any(self.translation)
+        return clock or mount or self.drift is not None or self.noise is not None
 
     @property
     def words(self) -> list[str]:
         """What is corrected, a few words each; empty where nothing is."""
         found = [f"poses stamped {self.delay:+.2f} ms late"] * bool(self.delay)
+        found += [f"their clock {self.delay_rate:+.3f} ms a second off"] * bool(self.delay_rate)
         found += [f"frames stamped {self.frame_delay:+.2f} ms late"] * bool(self.frame_delay)
         turn, shift = (float(np.linalg.norm(part)) for part in (self.rotation, self.translation))
         found += [f"mount turned by {np.degrees(turn):.2f} degrees"] * bool(turn)
         found += [f"mount shifted by {1e3 * shift:.1f} mm"] * bool(shift)
         found += [f"focal length {self.focal_scale:.4f} of the stated one"] * (self.focal_scale != 1.0)
         found += [f"distortion {self.distortion:+.4f}"] * bool(self.distortion)
-        return [*found, *["a drift of the poses"] * (self.drift is not None)]
+        found += ["a drift of the poses"] * (self.drift is not None)
+        return [*found, *["noise of the poses"] * (self.noise is not None)]
 
     @property
     def changes_lens(self) -> bool:
@@ -125,13 +146,28 @@ class Corrections:
             directions=directions,
         )
 
+    def stamped(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Int64[np.ndarray, " times"]:
+        """What the clock of the given poses shows at some times (ns) of the events."""
+        grown = 1e-3 * self.delay_rate * (times - _middle(given))
+        return times + round(MILLISECOND * self.delay) + grown.round().astype(np.int64)
+
+    def _inner_times(self, given: Trajectory, own: Trajectory) -> Int64[np.ndarray, " poses"]:
+        """Times (ns) of the events at which the clock of the given poses shows those of a camera's own, within their
+        span, and the ends of that."""
+        middle = _middle(given)
+        since = (own.times - middle - round(MILLISECOND * self.delay)) / (1.0 + 1e-3 * self.delay_rate)
+        times = np.unique(middle + since.round().astype(np.int64))
+        inside = times[(times > own.start) & (times < own.end)]
+        return np.concatenate([[own.start], inside, [own.end]])
+
     def poses(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
         """Poses of the camera of the events, at any times (ns): beyond the given poses it goes on at its last speed."""
-        poses = poses_at(given, times + round(MILLISECOND * self.delay))
+        poses = poses_at(given, self.stamped(given, times))
         poses = _moved(poses, np.array([self.translation]), np.array([self.rotation]))
-        if self.basis is not None and self.drift is not None:
-            values = self.basis.at(times) @ self.drift
-            poses = _moved(poses, values[:, :3], values[:, 3:])
+        for drift in (self.drift, self.noise):
+            if drift is not None:
+                values = drift.at(times)
+                poses = _moved(poses, values[:, :3], values[:, 3:])
         return poses
 
     def trajectory(self, given: Trajectory) -> Trajectory:
@@ -140,7 +176,7 @@ class Corrections:
         if not self.moves_poses:
             return given
         if self._made is None or self._made[0] is not given:
-            times = _inner_times(given, self.delay)
+            times = self._inner_times(given, given)
             object.__setattr__(self, "_made", (given, _trajectory(times, self.poses(given, times))))
         assert self._made is not None
         return self._made[1]
@@ -162,8 +198,8 @@ class Corrections:
             return found
         if of_frames is of_events:
             return replace(found, trajectory=self.trajectory(of_events))
-        knots = _inner_times(of_frames, self.delay)
-        stamped, poses = knots + round(MILLISECOND * self.delay), self.poses(of_events, knots)
+        knots = self._inner_times(of_events, of_frames)
+        stamped, poses = self.stamped(of_events, knots), self.poses(of_events, knots)
         before, own = poses_at(of_events, stamped), poses_at(of_frames, stamped)
         back = before[:, :, :3].transpose(0, 2, 1)
         mount = back @ np.concatenate([own[:, :, :3], own[:, :, 3:] - before[:, :, 3:]], axis=2)
@@ -217,12 +253,8 @@ def _moved(
     return np.concatenate([rotation @ Rotation.from_rotvec(turns).as_matrix(), position[..., None]], axis=-1)
 
 
-def _inner_times(given: Trajectory, delay: float) -> Int64[np.ndarray, " poses"]:
-    """Times (ns) at which a trajectory has poses when its clock is set back by a delay (ms), within its span, and the
-    ends of that."""
-    times = given.times - round(MILLISECOND * delay)
-    inside = times[(times > given.start) & (times < given.end)]
-    return np.concatenate([[given.start], inside, [given.end]])
+def _middle(given: Trajectory) -> int:
+    return (given.start + given.end) // 2
 
 
 def _trajectory(times: Int64[np.ndarray, " poses"], poses: Float64[np.ndarray, "poses 3 4"]) -> Trajectory:

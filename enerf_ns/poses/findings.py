@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import evenly_spaced
-from enerf_ns.poses.corrections import Corrections
+from enerf_ns.poses.corrections import Corrections, Drift
 from enerf_ns.poses.refiner import TOLD, Part, PoseRefiner
 
 INSTANTS, PLACES = 64, 5
@@ -18,10 +18,12 @@ INSTANTS, PLACES = 64, 5
 
 FLAGS: dict[Part, str] = {
     "clock": "--pipeline.refine-clock",
+    "rate": "--pipeline.refine-clock",
     "rotation": "--pipeline.refine-mount",
     "translation": "--pipeline.refine-mount",
     "lens": "--pipeline.refine-lens",
     "drift": "--pipeline.refine-drift",
+    "noise": "--pipeline.refine-drift",
 }
 
 
@@ -53,23 +55,23 @@ def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
         distance: Usual depth of the scene, metres.
     """
     now, recording = refiner.corrections, refiner.recording
-    errors = {part: refiner.errors_of(part) for part in refiner.parts}
+    errors = {part: refiner.errors_of(part) for part in refiner.parts if part != "noise"}
     turn, turn_error = (np.degrees(np.linalg.norm(both)) for both in (now.rotation, errors["rotation"]))
     shift, shift_error = (1e3 * np.linalg.norm(both) for both in (now.translation, errors["translation"]))
     focal_error, *distortion_error = errors["lens"]
     lens = f"focal length {now.focal_scale:.4f} ± {focal_error:.4f} of the stated one"
     if distortion_error:
         lens += f", first coefficient of distortion {now.distortion:+.4f} ± {distortion_error[0]:.4f}"
-    drift = "none"
-    if now.basis is not None and now.drift is not None:
-        values = now.basis.at(evenly_spaced(now.basis.start, now.basis.end, 256)) @ now.drift
-        far, wide = (np.sqrt((values[:, some] ** 2).sum(axis=1).mean()) for some in (slice(3), slice(3, 6)))
-        drift = f"{1e3 * far:.2g} mm and {np.degrees(wide):.2g} degrees, root mean square"
     one_by_one = {
         "clock": (
             "clock of the poses",
             f"{now.delay:+.2f} ± {errors['clock'][0]:.2f} ms late",
             replace(now, delay=0.0),
+        ),
+        "rate": (
+            "rate of their clock",
+            f"{now.delay_rate:+.3f} ± {errors['rate'][0]:.3f} ms a second",
+            replace(now, delay_rate=0.0),
         ),
         "rotation": (
             "mount, rotation",
@@ -82,14 +84,24 @@ def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
             replace(now, translation=(0.0, 0.0, 0.0)),
         ),
         "lens": ("lens", lens, replace(now, focal_scale=1.0, distortion=0.0)),
-        "drift": ("drift", drift, replace(now, drift=None)),
+        "drift": ("drift", _size(now.drift), replace(now, drift=None)),
     }
+    if "noise" in refiner.parts:
+        one_by_one["noise"] = ("noise that smoothing left", _size(now.noise), replace(now, noise=None))
     found = []
     for part, (what, value, without) in one_by_one.items():
-        told = part == "drift" or bool((errors[part] < TOLD * refiner.units[part]).all())
+        told = part in ("drift", "noise") or bool((errors[part] < TOLD * refiner.units[part]).all())
         moved = picture_shift(recording, without, now, distance)
         found.append(Finding(what, value, part in refiner.corrected, told, moved, FLAGS[part]))
     return found
+
+
+def _size(drift: Drift | None) -> str:
+    if drift is None:
+        return "none"
+    values = drift.at(evenly_spaced(drift.basis.start, drift.basis.end, 256))
+    far, wide = (np.sqrt((values[:, some] ** 2).sum(axis=1).mean()) for some in (slice(3), slice(3, 6)))
+    return f"{1e3 * far:.2g} mm and {np.degrees(wide):.2g} degrees, root mean square"
 
 
 def picture_shift(recording: EventRecording, first: Corrections, second: Corrections, distance: float) -> float:

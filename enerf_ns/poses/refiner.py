@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Optional
+from typing import TYPE_CHECKING, Any, Optional
 
 import numpy as np
 import torch
@@ -21,23 +21,26 @@ from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.recording import EventRecording
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.poses.corrections import Corrections, DriftBasis
+from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis
 
 if TYPE_CHECKING:
     from enerf_ns.enerf_model import EnerfModel
 
 Part = str
-"""Something that may be wrong: clock, rotation (of the mount), translation (of it), lens, or drift."""
+"""Something that may be wrong: clock, rate (of the clock), rotation (of the mount), translation (of it), lens, drift,
+or noise (that smoothing left)."""
 
 UNITS: dict[Part, float] = {
     "clock": 20.0,
+    "rate": 0.1,
     "rotation": math.radians(1.0),
     "translation": 0.01,
     "lens": 0.03,
     "drift": 1.0,
+    "noise": 1.0,
 }
 """How large each number may be expected to be: its unit here, and the standard deviation of what is known of it
-beforehand. Milliseconds, radians, metres, shares."""
+beforehand. Milliseconds, milliseconds a second, radians, metres, shares."""
 
 STARTS_WITHIN: dict[Part, float] = {"clock": 1.0, "lens": 0.03}
 """Milliseconds, and share of the focal length, within which what it starts from is right: standard deviation."""
@@ -50,6 +53,12 @@ DRIFT_UNITS = np.array([0.01] * 3 + [math.radians(0.5)] * 3)
 
 PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = 0.2, 6, 60
 """Length (s) of the pieces of a drift, and their fewest and most number."""
+
+NOISE_POSES, MOST_NOISE_PIECES = 2, 160
+"""Intervals between poses in a piece of the noise, and most pieces of it."""
+
+NOISE_LEFT = 0.6
+"""What is expected of the noise after smoothing, of what was taken off: standard deviations."""
 
 FIRST_STEP = 50
 """Steps before which a field shows too little."""
@@ -92,10 +101,12 @@ LARGEST_STEP = 0.5
 
 LIMITS: dict[Part, tuple[float, str]] = {
     "clock": (5.0, "the clock of the poses would have to be corrected by more than 100 ms"),
+    "rate": (100.0, "the clock of the poses would have to be corrected by more than 10 ms a second"),
     "rotation": (10.0, "the mount would have to be turned by more than 10 degrees"),
     "translation": (20.0, "the mount would have to be shifted by more than 200 mm"),
     "lens": (8.0, "the focal length would have to be corrected by more than 24 %"),
     "drift": (20.0, "the poses would have to drift by more than 200 mm or 10 degrees"),
+    "noise": (20.0, "the noise of the poses would have to be more than 12 times what was taken off"),
 }
 """Largest corrections, in their units, that are believed, and what is said of larger ones."""
 
@@ -135,7 +146,8 @@ class RefinerConfig:
     """Correct the focal length and the first coefficient of distortion. None: where the events show that they are
     wrong."""
     refine_drift: Optional[bool] = None  # noqa: UP045
-    """Correct a smooth drift of the poses. None: where the events show that there is one."""
+    """Correct a smooth drift of the poses, and what noise smoothing has left. None: where the events show that there is
+    a drift; noise where poses were smoothed."""
 
 
 class PoseRefiner(nn.Module):
@@ -176,8 +188,18 @@ class PoseRefiner(nn.Module):
         pieces = min(max(pieces, FEWEST_PIECES), MOST_PIECES)
         self.basis = DriftBasis(trajectory.start, trajectory.end, pieces)
         has_coefficients = recording.camera.model != "lookup"
-        sizes: dict[Part, int] = {"clock": 1, "rotation": 3, "translation": 3, "lens": 1 + has_coefficients}
+        sizes: dict[Part, int] = {"clock": 1, "rate": 1, "rotation": 3, "translation": 3, "lens": 1 + has_coefficients}
         sizes["drift"] = 6 * self.basis.size
+        taken_off, noise_units = recording.pose_noise_taken_off, np.zeros(0)
+        self.noise_basis: DriftBasis | None = None
+        if taken_off is not None and config.refine_drift is not False:
+            wanted_pieces = (trajectory.end - trajectory.start) / (NOISE_POSES * np.median(np.diff(trajectory.times)))
+            pieces = int(np.clip(round(wanted_pieces), 1, MOST_NOISE_PIECES))
+            self.noise_basis = DriftBasis(trajectory.start, trajectory.end, pieces)
+            # white noise, of which a piece that is longer than wanted averages the more
+            left = NOISE_LEFT * math.sqrt(min(pieces / wanted_pieces, 1.0)) * np.repeat(taken_off, 3)
+            noise_units = np.tile(left, self.noise_basis.size)
+            sizes["noise"] = len(noise_units)
         ends = np.cumsum([*sizes.values()])
         self.parts: dict[Part, slice] = {
             part: slice(end - size, end) for (part, size), end in zip(sizes.items(), ends, strict=True)
@@ -195,24 +217,27 @@ class PoseRefiner(nn.Module):
         self._before[drift, drift] += np.kron(self.basis.roughness, np.eye(6))
         self._units = np.concatenate([np.full(size, UNITS[part]) for part, size in sizes.items()])
         self._units[drift] = np.tile(DRIFT_UNITS, self.basis.size)
+        if self.noise_basis is not None:
+            self._units[self.parts["noise"]] = noise_units
         if has_coefficients:
             self._units[self.parts["lens"].stop - 1] = _distortion_unit(recording.camera)
         wanted: dict[Part, bool | None] = {
             "clock": config.refine_clock,
+            "rate": config.refine_clock,
             "rotation": config.refine_mount,
             "translation": config.refine_mount,
             "lens": config.refine_lens,
             "drift": config.refine_drift,
         }
-        self.wanted = [part for part in self.parts if wanted[part] is True]
+        self.wanted = [part for part in wanted if wanted[part] is True]
         turns = turns_about_two_axes(trajectory)
         self.allowed = [
             part
-            for part in self.parts
-            if wanted[part] or (wanted[part] is None and (turns or part in ("clock", "drift")))
+            for part in wanted
+            if wanted[part] or (wanted[part] is None and (turns or part in ("clock", "rate", "drift")))
         ]
         for number, part in enumerate(self.parts):
-            self.is_corrected[number] = wanted[part] is True
+            self.is_corrected[number] = part == "noise" or wanted[part] is True
         starts: dict[Part, float] = {"clock": config.clock_ms or 0.0, "lens": (config.focal_scale or 1.0) - 1.0}
         self._expected = np.zeros(whole)
         for part, start in starts.items():
@@ -222,9 +247,19 @@ class PoseRefiner(nn.Module):
                 self._before[number, number] = (unit / STARTS_WITHIN[part]) ** 2
                 self.is_corrected[list(self.parts).index(part)] = True
 
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        """Of runs from before the rate of the clock, the second number, and noise were told, too."""
+        if len(state_dict.get(f"{prefix}value", self.value)) < len(self.value):
+            for name in ("value", "is_corrected"):
+                found, known = torch.zeros_like(getattr(self, name)), state_dict[prefix + name]
+                found[0], found[2 : 1 + len(known)] = known[0], known[1:]
+                state_dict[prefix + name] = found
+            state_dict[f"{prefix}normal"], state_dict[f"{prefix}right"] = self.normal, self.right
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     @property
     def units(self) -> dict[Part, Float64[np.ndarray, " numbers"]]:
-        """How large each number may be expected to be: milliseconds, radians, metres, shares."""
+        """How large each number may be expected to be, as in `UNITS`."""
         return {part: self._units[where] for part, where in self.parts.items()}
 
     @property
@@ -236,16 +271,21 @@ class PoseRefiner(nn.Module):
     def corrections(self) -> Corrections:
         """As they are."""
         numbers = {part: (self.value.numpy() * self._units)[where] for part, where in self.parts.items()}
-        drifts = "drift" in self.corrected
+        drift = noise = None
+        if "drift" in self.corrected:
+            drift = Drift(self.basis, numbers["drift"].reshape(-1, 6))
+        if self.noise_basis is not None and numbers["noise"].any():
+            noise = Drift(self.noise_basis, numbers["noise"].reshape(-1, 6))
         return Corrections(
             delay=float(numbers["clock"][0]),
+            delay_rate=float(numbers["rate"][0]),
             frame_delay=self.config.frame_delay_ms or 0.0,
             rotation=tuple(numbers["rotation"].tolist()),
             translation=tuple(numbers["translation"].tolist()),
             focal_scale=1.0 + float(numbers["lens"][0]),
             distortion=float(numbers["lens"][1:].sum()),
-            basis=self.basis if drifts else None,
-            drift=numbers["drift"].reshape(-1, 6) if drifts else None,
+            drift=drift,
+            noise=noise,
         )
 
     def look(
@@ -298,16 +338,21 @@ class PoseRefiner(nn.Module):
         shift = (back @ (late[:, :, 3:] - early[:, :, 3:]))[..., 0]
         turn = Rotation.from_matrix(back @ late[:, :, :3]).as_rotvec()
         a_millisecond = np.concatenate([shift, turn], axis=1)
-        drift = self.basis.at(times)[:, :, None] * twists[:, None, :]
+        by_clock = (twists * a_millisecond).sum(axis=1, keepdims=True)
+        trajectory = self.recording.trajectory
         columns: dict[Part, np.ndarray] = {
-            "clock": (twists * a_millisecond).sum(axis=1, keepdims=True),
+            "clock": by_clock,
+            "rate": by_clock * (1e-9 * (times - (trajectory.start + trajectory.end) // 2))[:, None],
             "rotation": twists[:, 3:],
             "translation": twists[:, :3],
             "lens": np.stack(
                 [(slopes.directions * slope[pixels]).sum(axis=1) for slope in self._lens_slopes()], axis=1
             ),
         }
-        return columns | {"drift": drift.reshape(len(times), -1)}
+        for part, basis in (("drift", self.basis), ("noise", self.noise_basis)):
+            if basis is not None:
+                columns[part] = (basis.at(times)[:, :, None] * twists[:, None, :]).reshape(len(times), -1)
+        return columns
 
     def _lens_slopes(self) -> list[Float64[np.ndarray, "pixels 3"]]:
         """By how much the directions of pixels change with each number of the lens."""
@@ -360,17 +405,30 @@ class PoseRefiner(nn.Module):
         change[free] = np.linalg.solve(damped, absolute[free]) - value[free]
         largest = float(np.abs(change[free[free < self.number]]).max(initial=0.0))
         change[free] *= min(1.0, LARGEST_STEP / max(largest, 1e-12))
+        if self.noise_basis is not None:
+            change[self.parts["noise"]] = self._change_of_noise(change)
         self.value += torch.from_numpy(change[: self.number])
         self.right.copy_(torch.from_numpy(MEMORY * (right - normal @ change) / believed))
         self.normal *= MEMORY
         self._check()
         return True
 
+    def _change_of_noise(self, change: Float64[np.ndarray, " whole"]) -> Float64[np.ndarray, " numbers"]:
+        """What the noise changes by once all else has changed.
+
+        What is rendered may be off by as much in each piece as it may be as a whole.
+        """
+        assert self.noise_basis is not None
+        noise, normal = self.parts["noise"], self.normal.numpy()
+        believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_pixel / self.noise_basis.size)
+        pull = believed * (self.right.numpy() - normal @ change)[noise] - self.value.numpy()[noise]
+        return np.linalg.solve(believed * normal[noise, noise] + np.eye(len(pull)), pull)
+
     def errors_of(self, part: Part) -> Float64[np.ndarray, " numbers"]:
         """Standard errors of the numbers of a part, in milliseconds, radians, metres or shares, whether it is corrected
         or not; those of the drift are of its coefficients."""
         believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_pixel)
-        parts = [other for other in self.parts if other == part or other in self.corrected]
+        parts = [other for other in self.parts if other == part or (other in self.corrected and other != "noise")]
         numbers = self._numbers(parts)
         some = np.ix_(numbers, numbers)
         variances = np.zeros(len(self.right))

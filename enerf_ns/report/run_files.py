@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from enerf_ns.checkpoints import newest_checkpoint, read_config
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
 
 if TYPE_CHECKING:
+    from enerf_ns.dataparsers.recording import EventRecording
     from enerf_ns.enerf_trainer import EnerfTrainerConfig
 
 RECENT_SECONDS = 600.0
@@ -126,3 +127,26 @@ def run_names(runs: list[RunFiles]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [str(run.folder) for run in runs]
+
+
+def refined_recording(run: Path, data: Path) -> EventRecording:
+    """A recording with clock, poses and lens as a run refined them; `as_read` is what they were before, and None where
+    nothing was.
+
+    Args:
+        run: Folder of the run, or its config.yml.
+        data: Folder of the recording.
+
+    Raises:
+        RecordingError: It is no run, or has no whole checkpoint.
+        FlagError: It was trained on another recording.
+    """
+    from enerf_ns.evaluation.runs import load  # here, since PyTorch and Nerfstudio take seconds
+
+    files = read_run(run)
+    if not files.stored:
+        raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
+    refined = load(files.config_file).pipeline.datamanager.recording
+    if refined.path != data:
+        raise FlagError(f"--run {run} was trained on {refined.path}, not on {data}; give a run of this recording.")
+    return refined

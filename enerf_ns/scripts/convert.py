@@ -60,16 +60,8 @@ class Convert:
 
     def _convert_refined(self, run: Path, source: Path, output_dir: Path) -> list[str]:
         """Writes the recording with the poses that a run refined."""
-        from enerf_ns.evaluation.runs import load  # here, since PyTorch and Nerfstudio take seconds
-        from enerf_ns.report.run_files import read_run
+        from enerf_ns.report.run_files import refined_recording  # here, since Nerfstudio takes seconds
 
-        files = read_run(run)
-        if not files.stored:
-            raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
-        refined = load(files.config_file).pipeline.datamanager.recording
-        if refined.path != source:
-            raise FlagError(
-                f"--run {run} was trained on {refined.path}, not on {source}; give a run of this recording."
-            )
+        refined = refined_recording(run, source)
         with new_folder(source, output_dir) as folder:
             return write_recording(refined, folder)

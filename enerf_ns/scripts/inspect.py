@@ -26,6 +26,9 @@ class Inspect:
     """Folder of the recording. It is only ever read."""
     output: Path | None = None
     """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
+    run: Path | None = None
+    """Run that was trained on the recording, or its config.yml: clock, poses and lens are taken as it refined them, and
+    shown beside what was stated."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 
     def main(self) -> None:
@@ -34,9 +37,18 @@ class Inspect:
         if output.is_dir():
             raise OutputError(f"--output {output} is a folder; give the name of an HTML file.")
         check_outside_recordings("--output", output, data)
-        inspection = Inspection.of(read_recording(data, **self.options.given()))
+        recording, corrections = read_recording(data, **self.options.given()), None
+        if self.run is not None:
+            from enerf_ns.report.pose_figure import corrections_over_time  # here, since Nerfstudio takes seconds
+            from enerf_ns.report.run_files import refined_recording
+
+            recording = refined_recording(self.run, data)
+            if recording.as_read is None:
+                print(printable(f"{self.run} found nothing wrong with clock, poses and lens; they are as stated."))
+            corrections = corrections_over_time(recording)
+        inspection = Inspection.of(recording)
         inspection.print_tables(CONSOLE)
-        page = inspection.page()
+        page = inspection.page(corrections)
         try:
             write_whole(output, page)
         except OSError as error:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.recording import EventRecording, Frames
 from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.poses.corrections import Corrections, DriftBasis, poses_at
+from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis, poses_at
 
 CAMERA = Camera(24, 18, 20.0, 22.0, 11.0, 9.5)
 OTHER = Camera(30, 20, 25.0, 25.0, 15.0, 10.0)
@@ -71,7 +71,7 @@ def test_poses_are_shifted_in_time_then_mounted_then_drift():
     given, basis = trajectory(), DriftBasis(0, SPAN, 6)
     drift = 0.01 * np.random.default_rng(0).normal(size=(basis.size, 6))
     turn, shift = (0.01, -0.02, 0.03), (0.002, 0.004, -0.001)
-    corrections = Corrections(5.0, 0.0, turn, shift, basis=basis, drift=drift)
+    corrections = Corrections(5.0, 0.0, turn, shift, drift=Drift(basis, drift))
     times = np.array([100, 333, 800]) * MILLISECOND
     pose = np.tile(np.eye(4), (3, 1, 1))
     pose[:, :3] = given.poses(torch.from_numpy(times + 5 * MILLISECOND)).numpy()
@@ -86,16 +86,22 @@ def test_poses_are_shifted_in_time_then_mounted_then_drift():
     assert (refined.start, refined.end) == (given.start, given.end)
 
 
-@pytest.mark.parametrize("delay", [-20.0, 3.5, 20.0])
-def test_a_clock_that_is_set_back_gives_the_right_trajectory(delay: float):
-    right, shift = trajectory(), round(delay * MILLISECOND)
-    late = Trajectory(right.times + shift, right.positions, right.quaternions)
-    refined = Corrections(delay).trajectory(late)
-    first, last = max(late.start, right.start), min(late.end, right.end) - abs(shift)
+@pytest.mark.parametrize(("delay", "rate"), [(-20.0, 0.0), (3.5, 0.0), (20.0, 0.0), (5.0, 8.0), (0.0, -8.0)])
+def test_a_clock_that_is_set_back_gives_the_right_trajectory(delay: float, rate: float):
+    """Of a rate, too, by which the delay grows from the middle of the poses on."""
+    right = trajectory()
+    shifts = delay * MILLISECOND + 1e-3 * rate * (right.times - SPAN / 2)
+    late = Trajectory(right.times + shifts.round().astype(np.int64), right.positions, right.quaternions)
+    since = 1e-6 * ((late.start + late.end) // 2 - SPAN / 2)  # by which the middle of the late poses is later
+    corrections = Corrections(delay + 1e-3 * rate * since, delay_rate=rate)
+    refined, shift = corrections.trajectory(late), round(1e6 * (abs(delay) + abs(rate)))
+    first, last = max(late.start, right.start), min(late.end, right.end) - shift
     inside = np.linspace(first + 20 * MILLISECOND, last - 20 * MILLISECOND, 200).astype(np.int64)
     found, wanted = (one.poses(torch.from_numpy(inside)).numpy() for one in (refined, right))
     np.testing.assert_allclose(found, wanted, atol=5e-5)
     assert (refined.start, refined.end) == (late.start, late.end)
+    own = right.times[20:-20]
+    assert np.abs(corrections.stamped(late, own) - late.times[20:-20]).max() <= 2
 
 
 def test_beyond_its_ends_a_trajectory_goes_on_at_its_last_speed():
@@ -147,14 +153,16 @@ def test_a_lens_without_distortion_gets_some():
 
 
 def test_words_say_each_correction():
-    basis = DriftBasis(0, SPAN, 6)
-    some = Corrections(5.0, -7.0, (np.radians(1.0), 0, 0), (0.003, 0, 0.004), 1.03, 0.01, basis, np.zeros((8, 6)))
+    drift = Drift(DriftBasis(0, SPAN, 6), np.zeros((8, 6)))
+    some = Corrections(5.0, -7.0, (np.radians(1.0), 0, 0), (0.003, 0, 0.004), 1.03, 0.01, 0.1, drift, drift)
     assert some.words == [
         "poses stamped +5.00 ms late",
+        "their clock +0.100 ms a second off",
         "frames stamped -7.00 ms late",
         "mount turned by 1.00 degrees",
         "mount shifted by 5.0 mm",
         "focal length 1.0300 of the stated one",
         "distortion +0.0100",
         "a drift of the poses",
+        "noise of the poses",
     ]

@@ -97,11 +97,13 @@ def test_slopes_are_those_of_finite_differences(number: int):
     assert np.abs(expected).max() > 0.05
 
 
-def looks(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float, number: int = 60, seed: int = 0) -> None:
+def looks(
+    refiner: PoseRefiner, wrong: dict[Part, Any], noise: float, number: int = 60, seed: int = 0, span: int = SPAN
+) -> None:
     """Has a refiner look at pairs whose brightness is a random linear function of the ray, as if poses were wrong."""
     random = np.random.default_rng(seed)
     for _ in range(number):
-        times = random.integers(0, SPAN, (2, 256))
+        times = random.integers(0, span, (2, 256))
         pixels = random.integers(0, CAMERA.width * CAMERA.height, 256)
         bends = random.normal(size=(512, 3 * NUM_SHAPES))
         slopes = Slopes(*200.0 * random.normal(size=(3, 512, 3)), bends=bends)
@@ -113,11 +115,11 @@ def looks(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float, number: in
         refiner.look(residual, slopes, times, pixels, others, lags)
 
 
-def solved(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float = 0.3) -> None:
+def solved(refiner: PoseRefiner, wrong: dict[Part, Any], noise: float = 0.3, span: int = SPAN) -> None:
     """Looks and solves until nothing is left, as while a field is trained that knows the scene."""
     for number in range(25):
         left = {part: np.atleast_1d(value) - found(refiner, part) for part, value in wrong.items()}
-        looks(refiner, left, noise, 6, number)
+        looks(refiner, left, noise, 6, number, span)
         refiner.solve(400)
 
 
@@ -142,6 +144,17 @@ def test_the_part_that_is_wrong_is_found_and_no_other(part: Part, value: Any):
     assert refiner.value.count_nonzero() == len(value)
 
 
+def test_a_clock_that_runs_fast_is_found_in_a_long_recording():
+    times = np.arange(0, 100 * SPAN + 1, 5_000_000)
+    short = trajectory()
+    rows = np.arange(len(times)) % (len(short.times) - 1)
+    long = Trajectory(times, short.positions[rows], short.quaternions[rows])
+    refiner = PoseRefiner(RefinerConfig(), replace(recording(), trajectory=long))
+    solved(refiner, {"rate": [0.1]}, span=100 * SPAN)
+    assert refiner.corrected == ["rate"]
+    assert refiner.corrections.delay_rate == pytest.approx(0.1, abs=0.005)
+
+
 def test_two_parts_are_found_together():
     refiner = PoseRefiner(RefinerConfig(), recording())
     solved(refiner, {"clock": [3.0], "lens": [0.02, 0.0]})
@@ -157,6 +170,52 @@ def test_a_drift_is_found():
     functions = refiner.basis.at(np.linspace(0, SPAN, 101).astype(np.int64))
     left, whole = functions @ (found(refiner, "drift").reshape(-1, 6) - wrong), functions @ wrong
     assert ((left**2).mean(axis=0) < 0.15 * (whole**2).mean(axis=0)).all()
+
+
+def noisy() -> PoseRefiner:
+    return PoseRefiner(RefinerConfig(), replace(recording(), pose_noise_taken_off=(0.002, 0.004)))
+
+
+def test_what_smoothing_left_of_noise_is_found_beside_a_clock():
+    """From the first solution on, with no test; it is not taken for a drift."""
+    refiner = noisy()
+    size = refiner.units["noise"].reshape(-1, 6)
+    np.testing.assert_allclose(size, np.tile([0.0012] * 3 + [0.0024] * 3, (len(size), 1)))
+    wrong = size * np.random.default_rng(5).normal(size=size.shape)
+    solved(refiner, {"noise": wrong.reshape(-1), "clock": [3.0]})
+    assert refiner.corrected == ["clock", "noise"]
+    assert found(refiner, "clock")[0] == pytest.approx(3.0, abs=0.1)
+    assert refiner.noise_basis is not None and refiner.corrections.noise is not None
+    functions = refiner.noise_basis.at(np.linspace(0, SPAN, 1001).astype(np.int64))
+    left, whole = functions @ (found(refiner, "noise").reshape(-1, 6) - wrong), functions @ wrong
+    assert ((left**2).mean(axis=0) < 0.2 * (whole**2).mean(axis=0)).all()
+    (row,) = [row for row in findings(refiner, 2.0) if row.what.startswith("noise")]
+    assert row.is_corrected and row.pixels > 0.0
+
+
+def test_noise_that_is_not_there_is_hardly_made_up():
+    refiner = noisy()
+    looks(refiner, {}, 1.0, 60)
+    refiner.solve(400)
+    assert refiner.corrected == ["noise"]
+    size = refiner.units["noise"]
+    assert np.sqrt(np.mean((found(refiner, "noise") / size) ** 2)) < 0.3
+
+
+def test_long_noise_is_found_in_pieces_that_average_it():
+    """Of white noise, four times as many poses have half of the standard deviation."""
+    long = trajectory()
+    long = Trajectory(
+        np.arange(4 * 321) * 5_000_000, np.resize(long.positions, (1284, 3)), np.resize(long.quaternions, (1284, 4))
+    )
+    refiner = PoseRefiner(RefinerConfig(), replace(recording(), trajectory=long, pose_noise_taken_off=(0.002, 0.004)))
+    assert refiner.noise_basis is not None and refiner.noise_basis.num_pieces == 160
+    assert refiner.units["noise"][0] == pytest.approx(0.6 * 0.002 / 2.0, rel=0.01)
+
+
+def test_no_drift_wanted_is_no_noise_either():
+    refiner = PoseRefiner(RefinerConfig(refine_drift=False), replace(recording(), pose_noise_taken_off=(0.002, 0.004)))
+    assert "noise" not in refiner.parts
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -210,7 +269,7 @@ def test_a_clock_that_is_stated_stays():
 
 def test_a_camera_that_turns_about_one_axis_tells_neither_mount_nor_lens():
     refiner = PoseRefiner(RefinerConfig(), recording(turns=0.01))
-    assert refiner.allowed == ["clock", "drift"]
+    assert refiner.allowed == ["clock", "rate", "drift"]
 
 
 def test_what_no_recording_is_wrong_by_is_an_error():
@@ -232,6 +291,21 @@ def test_a_stored_refiner_goes_on_where_it_was():
         refiner.solve(400)
     assert second.corrected == first.corrected == ["clock"]
     assert torch.equal(first.value, second.value)
+
+
+def test_a_run_from_before_the_rate_of_the_clock_keeps_its_numbers():
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    solved(refiner, {"clock": [4.0], "lens": [0.03, -0.02]})
+    new = refiner.state_dict()
+    old = {name: new[name].clone() for name in ("value", "is_corrected", "normal", "right", "looks")}
+    kept = torch.arange(len(old["right"])) != 1
+    old["value"], old["right"] = old["value"][kept[: len(old["value"])]], old["right"][kept]
+    old["normal"], old["is_corrected"] = old["normal"][kept][:, kept], old["is_corrected"][[0, 2, 3, 4, 5]]
+    again = noisy()
+    again.load_state_dict(old)
+    assert again.corrected == refiner.corrected
+    for part in refiner.parts:
+        np.testing.assert_array_equal(found(again, part), found(refiner, part))
 
 
 def test_findings_say_what_was_found_and_what_is_not_told():
