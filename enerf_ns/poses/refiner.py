@@ -237,7 +237,7 @@ class PoseRefiner(nn.Module):
             if wanted[part] or (wanted[part] is None and (turns or part in ("clock", "rate", "drift")))
         ]
         for number, part in enumerate(self.parts):
-            self.is_corrected[number] = part == "noise" or wanted[part] is True
+            self.is_corrected[number] = part in self._always or wanted[part] is True
         starts: dict[Part, float] = {"clock": config.clock_ms or 0.0, "lens": (config.focal_scale or 1.0) - 1.0}
         self._expected = np.zeros(whole)
         for part, start in starts.items():
@@ -388,7 +388,7 @@ class PoseRefiner(nn.Module):
         believed = 1.0 / (1.0 + systematic**2 * self._information_a_pixel)
         normal, right = believed * self.normal.numpy(), believed * self.right.numpy()
         value = np.zeros(len(right))
-        for part in self.allowed:
+        for part in [*self.allowed, *self._always]:
             value[self.parts[part]] = self.value.numpy()[self.parts[part]]
         absolute = right + normal @ value + self._before @ self._expected
         parts = self._best_parts(normal, absolute)
@@ -403,6 +403,8 @@ class PoseRefiner(nn.Module):
         damped = normal[np.ix_(free, free)] + self._before[np.ix_(free, free)]
         change = -value  # of what is no longer corrected, all at once
         change[free] = np.linalg.solve(damped, absolute[free]) - value[free]
+        for part in self._always:
+            change[self.parts[part]] = 0.0
         largest = float(np.abs(change[free[free < self.number]]).max(initial=0.0))
         change[free] *= min(1.0, LARGEST_STEP / max(largest, 1e-12))
         if self.noise_basis is not None:
@@ -438,7 +440,13 @@ class PoseRefiner(nn.Module):
     def _numbers(self, parts: Sequence[Part]) -> Int64[np.ndarray, " free"]:
         """Places of the numbers of some parts in a solution, and of all that is solved for beside them."""
         whole = np.arange(len(self.right))
-        return np.concatenate([*(whole[self.parts[part]] for part in parts), whole[self.number :]])
+        chosen = [*parts, *(part for part in self._always if part not in parts)]
+        return np.concatenate([*(whole[self.parts[part]] for part in chosen), whole[self.number :]])
+
+    @property
+    def _always(self) -> list[Part]:
+        """Parts that are corrected without a test."""
+        return [part for part in self.parts if part == "noise"]
 
     def _chance(self, part: Part) -> float:
         """What numbers that are all nothing hardly ever explain of the squared error, in units of its variance."""
