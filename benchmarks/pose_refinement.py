@@ -46,14 +46,22 @@ largest, and of the mount; the focal length as a multiple of the right one."""
 OFF = {f"pipeline.poses.refine_{part}": False for part in ("clock", "mount", "lens", "drift")} | {
     "pipeline.datamanager.dataparser.smooth_poses": False
 }
-ROWS = {"fixed": OFF, "refined": {}}
+ROWS = {"fixed": OFF, "refined": {}, "contrast": OFF, "adam": {}}
+"""Changes to the configuration. Beside poses as they are, and refined: what the sharpest events tell of clock and focal
+length before training, and nothing later; and all numbers at once by Adam, at every look, without a test of what is
+wrong, as other codes refine poses."""
+
+COMPARED = "fixed", "refined"
+
+ADAM_RATE, ADAM_DECAYS = 0.02, (0.9, 0.99)
+"""Learning rate, in the unit of each number, and decays of the moments."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", nargs="+", default=["shapes", "clutter", "floor", "relief-large"])
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
+    parser.add_argument("--rows", nargs="+", default=list(COMPARED), choices=list(ROWS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side, of one thread each")
@@ -198,6 +206,10 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         "evaluation_share": 0.0,
         **ROWS[cell["row"]],
     }
+    if cell["row"] == "contrast":
+        changes |= sharpest(folder)
+    elif cell["row"] == "adam":
+        refine_by_adam()
     config = method_config("enerf", folder, work / "runs", changes)
     config.timestamp = "-".join(str(value) for value in cell.values())
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)  # of a training that was broken off
@@ -221,6 +233,50 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         "ate_before": errors(true, given.trajectory),
         "ate_after": errors(true, after.trajectory),
     }
+
+
+def sharpest(folder: Path) -> dict[str, Any]:
+    """Clock and focal length with which events are sharpest, as flags."""
+    from enerf_ns.dataparsers.agreement import clock_and_lens
+    from enerf_ns.dataparsers.depth_range import scene_depth_range
+    from enerf_ns.dataparsers.formats.registry import read_recording
+
+    recording = read_recording(folder)
+    found = clock_and_lens(recording, float(np.sqrt(np.prod(scene_depth_range(recording)))))
+    if found is None:
+        return {}
+    delay, scale = found
+    return {
+        "pipeline.poses.clock_ms": delay.value if delay.is_told else 0.0,
+        "pipeline.poses.focal_scale": scale.value if scale.is_told else 1.0,
+    }
+
+
+def refine_by_adam() -> None:
+    """Has the refiner go down the slope of the squared error of each look by Adam (Kingma and Ba, ICLR 2015)."""
+    import torch
+
+    from enerf_ns import enerf_pipeline
+    from enerf_ns.poses.refiner import PoseRefiner
+
+    def solve(self: Any, step: int, may_begin: bool = True) -> bool:
+        self.is_corrected[:] = True
+        slope = self.right[: self.number].clone()
+        first, second, count = self.__dict__.setdefault("moments", [0.0, 0.0, 0])
+        first = ADAM_DECAYS[0] * first + (1.0 - ADAM_DECAYS[0]) * slope
+        second = ADAM_DECAYS[1] * second + (1.0 - ADAM_DECAYS[1]) * slope**2
+        count += 1
+        self.__dict__["moments"] = [first, second, count]
+        first, second = (
+            moment / (1.0 - decay**count) for moment, decay in zip((first, second), ADAM_DECAYS, strict=True)
+        )
+        self.value += ADAM_RATE * first / (second.sqrt() + 1e-12)
+        self.right.zero_()
+        self.normal.zero_()
+        return bool(torch.isfinite(self.value).all())
+
+    PoseRefiner.solve = solve  # type: ignore
+    enerf_pipeline.LOOKS_A_SOLUTION = 1
 
 
 def errors(true: Any, other: Any) -> tuple[float, float]:
@@ -249,9 +305,11 @@ def table(results: list[dict[str, Any]]) -> str:
         values = [row[key] if number is None else row[key][number] for row in rows if key in row]
         return float(np.mean(values)) if values else float("nan")
 
+    others = [row for row in ROWS if row not in COMPARED and any(row in found for found in cells.values())]
     head = (
         "recording", "wrong", "seeds", "PSNR fixed", "refined", "right", "correlation fixed", "refined",
         "trajectory, mm", "refined", "degrees", "refined", "clock, ms", "focal length", "time refined / fixed",
+        *(f"PSNR {row}" for row in others),
     )  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for (recording, fault), rows in sorted(cells.items(), key=lambda cell: (cell[0][0], [*FAULTS].index(cell[0][1]))):
@@ -270,6 +328,7 @@ def table(results: list[dict[str, Any]]) -> str:
             ", ".join(f"{row['clock']:.2f}" for row in refined),
             ", ".join(f"{row['focal']:.4f}" for row in refined),
             f"{mean(refined, 'seconds') / mean(fixed, 'seconds'):.2f}",
+            *(f"{mean(rows.get(row, []), 'psnr'):.2f}" for row in others),
         ]
         lines.append(f"| {' | '.join(numbers)} |")
     return "\n".join(lines)

@@ -83,7 +83,7 @@ SURE, STAYS = 9.0, 3.0
 """By how much the squared error, in units of its variance, must fall beyond what chance explains before something is
 corrected, and for it to stay so."""
 
-SYSTEMATIC = 0.02
+SYSTEMATIC = 0.01
 """Pixels by which what is rendered may be off as a whole in any one way, however much was seen: standard deviation."""
 
 SETTLED_AFTER = 200.0
