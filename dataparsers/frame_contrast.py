@@ -4,7 +4,8 @@ brightness, and the level of brightness."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -44,6 +45,10 @@ FAINTEST = 0.01
 
 FEWEST_ROWS = 1000
 """Fewest changes of a pixel between frames that thresholds are fitted to."""
+
+FEWEST_QUIET, EXPOSURE_CHANGES = 200, 0.04
+"""Fewest pixels without events between two frames that tell how exposure changed, and by how much, of log brightness,
+it must from frame to frame to be one that changes."""
 
 INSTANTS = 5
 """Instants of an exposure at which events are counted."""
@@ -109,6 +114,27 @@ def thresholds_from_frames(
     if not (np.all((values > least) & (values < largest)) and np.all(errors < LARGEST_ERROR * values)):
         return None
     return values, errors, why
+
+
+def exposure_change(recording: EventRecording, frames: Frames) -> float | None:
+    """By how much the exposure of frames changes from one to the next, root mean square of log brightness.
+
+    It is told by pixels that saw no event between two frames: what they see changed by less than a threshold, up as
+    often as down, so the median of their change is that of the exposure.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        frames: Those that may be looked at.
+
+    Returns:
+        None where another camera took the frames, or too few pixels are without events.
+
+    Raises:
+        RecordingError: The file of a frame is missing or cannot be decoded.
+    """
+    if frames.camera != recording.camera or frames.trajectory is not recording.trajectory:
+        return None
+    return _Comparison(recording, index_events(recording), frames).exposure_change
 
 
 def mean_brightness(recording: EventRecording, frames: Frames, event_share: float) -> float | None:
@@ -194,6 +220,23 @@ class _Comparison:
         """Whether frames are of an instant, as far as is known."""
         return not np.ptp(self.frames.exposed, axis=1).any()
 
+    @cached_property
+    def exposure_change(self) -> float | None:
+        """As `exposure_change` says."""
+        number = len(self.frames.times)
+        if number < 2:
+            return None
+        firsts = np.unique(np.linspace(0, number - 2, NUM_STARTS).round().astype(int))
+        found = [self._exposure_step(*map(self._seen, (first, first + 1))) for first in firsts.tolist()]
+        told = [step for step in found if step is not None]
+        return float(np.sqrt(np.mean(np.square(told)))) if 2 * len(told) > len(found) else None
+
+    def _exposure_step(self, one: _Seen, other: _Seen) -> float | None:
+        """By how much log exposure changes between two frames; None where too few pixels saw no event."""
+        table, _, change = self._difference(one, other)
+        quiet = change[~table.any(axis=1)]
+        return float(np.median(quiet)) if len(quiet) >= FEWEST_QUIET else None
+
     def of_counts(self) -> tuple[np.ndarray, np.ndarray, str] | None:
         """Thresholds of a sensor that sees all changes."""
         number = len(self.frames.times)
@@ -208,6 +251,9 @@ class _Comparison:
         for i, start in enumerate(starts.tolist()):
             one, other, third = (self._seen(start + step * lag) for step in range(3))
             for j, after in enumerate((other, third)):
+                if self.exposure_change is not None and self.exposure_change > EXPOSURE_CHANGES:
+                    step = self._exposure_step(one, after) or 0.0
+                    after = replace(after, brightness=after.brightness - step)
                 table, instruments, change = self._difference(one, after)
                 squares[i, j], products[i, j] = instruments.T @ table, instruments.T @ change
                 rows += np.count_nonzero(table.any(axis=1)) if j == 0 else 0

@@ -21,10 +21,10 @@ from enerf_ns.dataparsers.agreement import clock_and_lens, clock_of_frames
 from enerf_ns.dataparsers.depth_range import scene_depth_range, share_beyond
 from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
-from enerf_ns.dataparsers.frame_contrast import mean_brightness
+from enerf_ns.dataparsers.frame_contrast import EXPOSURE_CHANGES, exposure_change, mean_brightness
 from enerf_ns.dataparsers.indexing import describe_gaps, index_events
 from enerf_ns.dataparsers.pose_noise import pose_noise
-from enerf_ns.dataparsers.recording import EventRecording, percent
+from enerf_ns.dataparsers.recording import EventRecording, Frames, percent
 from enerf_ns.dataparsers.scene_box import scene_normalisation
 from enerf_ns.dataparsers.sensor_estimates import (
     Estimate,
@@ -787,6 +787,21 @@ class _Resolver:
             value = f"{frames.camera.width} x {frames.camera.height}, {frames.camera.model}" if second else ""
             why = "the calibration states it" if second else "frames and events are of one camera"
             self.row("second camera", second, value, why, name)
+        self._exposure_of_frames(frames)
+
+    def _exposure_of_frames(self, frames: Frames | None) -> None:
+        """Whether the exposure of each frame is learned."""
+        name = "model.learn_exposure"
+        change, learns = None, self.use_events and self.config.defaults.learns_sensor
+        if learns and frames is not None and self.recording.reconstructed_by is None:
+            trained, _ = split_frames(self.recording, self.parser, held_out=False)
+            change = exposure_change(self.recording, trained)
+        learns = self.use(name, lambda: change is not None and change > EXPOSURE_CHANGES)
+        why = "nothing tells whether the exposure of frames changes"
+        if change is not None:
+            why = f"pixels without events change by {100 * change:.2g} % from frame to frame"
+        value = "a gain and an offset of each are learned" if learns else ""
+        self.row("exposure of frames", bool(learns), value, self.why(name, why), name)
 
     def _colour(self) -> None:
         """How many colour channels the field has."""

@@ -108,6 +108,9 @@ class EnerfModelConfig(ModelConfig):
     0, or as the paper for enerf-paper."""
     frame_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`ErrorBalance`)."""
+    learn_exposure: Optional[bool] = None  # noqa: UP045
+    """Learn a gain and an offset of each frame. None: beside events, where pixels that saw no event between two frames
+    tell that the exposure changed."""
     level_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the squared difference between the mean log brightness of a batch and that of mean-brightness. None:
     0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
@@ -207,6 +210,7 @@ class EnerfModel(Model):
         self.sensor = config.sensor.setup()
         self.frame_balance = ErrorBalance() if config.frame_loss_weight is None else None
         self.instant_balance = ErrorBalance()
+        self.exposure = FrameExposure(self.num_train_data) if config.learn_exposure else None
         self.supervision = EventSupervision(
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
@@ -263,6 +267,8 @@ class EnerfModel(Model):
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {"fields": [*self.field.parameters(), *(self.proposal.parameters() if self.proposal else ())]}
+        if self.exposure is not None:
+            groups["fields"] += self.exposure.parameters()
         return groups | self.sensor.get_param_groups()
 
     def get_training_callbacks(
@@ -450,6 +456,8 @@ class EnerfModel(Model):
         return metrics
 
     def _frame_loss(self, rendered: Tensor, frames: FrameBatch) -> Tensor:
+        if self.exposure is not None:
+            rendered = self.exposure(rendered, frames.indices[:, 0])
         return frame_loss(rendered, frames.colours, grey=self.is_grey or frames.are_grey)
 
     @property

@@ -146,6 +146,8 @@ class EnerfPipeline(VanillaPipeline):
         self._fit_memory(trains)
         if trains:
             self._start_threshold_map()
+        if self.model.exposure is not None:
+            self.model.exposure.times.copy_(torch.from_numpy(self.datamanager.train_dataset.frames.times))
         self.poses: PoseRefiner | None = None
         if "events" in config.datamanager.supervision and world_size == 1:
             self.poses = PoseRefiner(config.poses, self.datamanager.recording)

@@ -420,6 +420,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "frame loss": ("events+frames", "events"),
         "second camera": ("events+frames", "events"),
         "exposure": (3, 1),
+        "exposure of frames": (True, False),
         "colour": (3, 1),
         "undistortion": (True, False),
         "contraction": (True, False),

@@ -58,7 +58,8 @@ class HeldOutView:
     recorded: Tensor | None
     """Frame in [0, 1], three channels; None where the recording has no frames."""
     rendered: Tensor
-    """Render as the field has it: linear brightness, 0 or more, three channels."""
+    """Render as the field has it: linear brightness, three channels; where the exposure of each frame is learned, with
+    that between the frames next to it in time."""
     depth: Tensor
     """Rendered depth in metres along the optical axis, one channel."""
     recorded_depth: Tensor | None
@@ -118,18 +119,22 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
     """
     manager = pipeline.datamanager
     dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
-    data, rays = dataset[number], _rays(pipeline, number, reduced_by)
+    data, rays, time = dataset[number], _rays(pipeline, number, reduced_by), int(dataset.frames.times[number])
     outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
     z_depth = metres * outputs["depth"] / rays.metadata["directions_norm"]
+    rendered, exposure = outputs["rgb"], pipeline.model.exposure
+    if exposure is not None:
+        gain, offset = exposure.at(time)
+        rendered = (gain * rendered + offset).clamp(min=0.0)
     depth = data.get("depth")
     if depth is not None and reduced_by > 1:
         depth = _reduced(depth, reduced_by) * (_reduced(is_known(depth).float(), reduced_by) == 1.0)
     return HeldOutView(
         recorded=_reduced(data["image"][..., :3], reduced_by) if dataset.are_frames else None,
-        rendered=outputs["rgb"].cpu(),
+        rendered=rendered.cpu(),
         depth=z_depth.cpu(),
         recorded_depth=depth,
-        time=int(dataset.frames.times[number]),
+        time=time,
         colour_filter=pipeline.model.sensor.colour_filter is not None,
     )
 

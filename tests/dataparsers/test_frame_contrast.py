@@ -10,7 +10,12 @@ import pytest
 from PIL import Image
 from waves import CAMERA, events_of_waves, recording_of
 
-from enerf_ns.dataparsers.frame_contrast import mean_brightness, thresholds_from_frames
+from enerf_ns.dataparsers.frame_contrast import (
+    EXPOSURE_CHANGES,
+    exposure_change,
+    mean_brightness,
+    thresholds_from_frames,
+)
 from enerf_ns.dataparsers.recording import EventRecording, Events
 
 FRAMES = np.arange(1, 40) * 25_000_000
@@ -27,6 +32,25 @@ def test_both_thresholds_are_measured(recording: EventRecording):
     values, errors, _ = found
     np.testing.assert_allclose(values, (0.28, 0.2), rtol=0.04)
     assert np.all(np.abs(values - (0.28, 0.2)) < 2 * errors) and np.all(errors < 0.1 * values)
+
+
+def test_exposure_that_changes_is_told_and_taken_off(recording: EventRecording, tmp_path: Path):
+    """By pixels without events; thresholds are then those of frames that were exposed alike."""
+    frames = recording.frames
+    assert frames is not None
+    steady = exposure_change(recording, frames)
+    assert steady is not None and steady < EXPOSURE_CHANGES
+    gains = np.random.default_rng(1).uniform(0.7, 1.0, len(frames.times))
+    names = tuple(tmp_path / name.name for name in frames.filenames)
+    for file, name, gain in zip(frames.filenames, names, gains, strict=True):
+        Image.fromarray((gain * np.asarray(Image.open(file)) + 0.5).astype(np.uint8)).save(name)
+    changing = replace(recording, frames=replace(frames, filenames=names))
+    assert changing.frames is not None
+    change = exposure_change(changing, changing.frames)
+    assert change == pytest.approx(np.sqrt(np.mean(np.diff(np.log(gains)) ** 2)), rel=0.3)
+    found, right = (thresholds_from_frames(one, 0) for one in (changing, recording))
+    assert found is not None and right is not None
+    np.testing.assert_allclose(found[0], right[0], rtol=0.05)
 
 
 def test_thresholds_are_in_the_units_of_the_stated_response(recording: EventRecording):
