@@ -20,6 +20,7 @@ from enerf_ns.evaluation.runs import load, method_config, train
 from enerf_ns.export import surface
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.export import Export
+from enerf_ns.scripts.inspect import Inspect
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +99,9 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     try:
         Export("poses", run, tmp_path / "poses.txt").main()
         Convert(recording, tmp_path / "new", run=run).main()
+        Inspect(recording, tmp_path / "inspect.html", run=run).main()
+        loaded = load(run / "config.yml").pipeline
+        manager: Any = loaded.config.datamanager.setup(test_mode="test", device="cpu")  # as ns-render dataset does
     finally:
         checkpoint.write_bytes(kept)
 
@@ -110,7 +114,12 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     np.testing.assert_allclose(Rotation.from_quat(rows[inside, 4:]).as_matrix(), expected[:, :, :3], atol=1e-6)
     camera = json.loads((tmp_path / "poses.json").read_text())
     assert camera["fx"] == given.camera.fx
-    assert [row["is_corrected"] for row in camera["corrections"]] == [True, False, False, False, False]
+    assert [row["is_corrected"] for row in camera["corrections"]] == [True] + 5 * [False]
+    assert "What was refined of the poses" in (tmp_path / "inspect.html").read_text()
+    seen, refined, stated = (
+        one.eval_dataset.cameras.camera_to_worlds for one in (manager, loaded.datamanager, pipeline.datamanager)
+    )
+    assert torch.equal(seen, refined) and not torch.equal(seen, stated)
     again = read_recording(tmp_path / "new").trajectory
     np.testing.assert_allclose(again.poses(torch.from_numpy(times[inside])).numpy(), expected, atol=1e-6)
 
