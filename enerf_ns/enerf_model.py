@@ -35,6 +35,7 @@ from enerf_ns.seen_volume import SeenVolume
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.balance import ErrorBalance
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
+from enerf_ns.supervision.frame_exposure import FrameExposure
 from enerf_ns.supervision.losses import distortion_loss, frame_loss
 
 FAINT = 5e-4

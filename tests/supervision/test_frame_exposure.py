@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.supervision.frame_exposure import FrameExposure
 from enerf_ns.supervision.losses import frame_loss
 
@@ -53,3 +59,29 @@ def test_between_frames_exposure_is_interpolated_in_time():
     exposure.times.copy_(torch.tensor([200, 100, 0]))
     assert exposure.at(150) == pytest.approx((1.1, 0.05), rel=1e-5)
     assert exposure.at(-50) == pytest.approx(exposure.at(0)) and exposure.at(500) == pytest.approx(exposure.at(200))
+
+
+@pytest.mark.slow
+def test_a_training_beside_frames_finds_how_each_was_exposed(tmp_path: Path):
+    """Nobody says that exposure changes; the offsets stay small, since there are none."""
+    folder = tmp_path / "shapes"
+    simulate(SimulationSettings("shapes", layout="event_recording"), folder)
+    files = sorted((folder / "frames").glob("*.png"))
+    gains = np.random.default_rng(0).uniform(0.6, 1.0, len(files))
+    for file, gain in zip(files, gains, strict=True):
+        Image.fromarray((gain * np.asarray(Image.open(file)) + 0.5).astype(np.uint8)).save(file)
+    changes = {
+        "max_num_iterations": 400,
+        "evaluation_share": 0.0,
+        "pipeline.datamanager.supervision": "events+frames",
+        "pipeline.datamanager.dataparser.train_frames": "sharp",
+    }
+    run = train(method_config("enerf", folder, tmp_path / "runs", changes))
+    exposure = run.pipeline.model.exposure
+    assert exposure is not None
+    frames = run.pipeline.datamanager.train_dataset.frames
+    wanted = np.log([gains[files.index(folder / "frames" / name.name)] for name in frames.filenames])
+    found = np.array([exposure.at(int(time)) for time in frames.times])
+    left = np.log(found[:, 0]) - (wanted - wanted.mean())
+    assert np.sqrt(np.mean(left**2)) < 0.2 * wanted.std()
+    assert np.abs(found[:, 1]).max() < 0.05
