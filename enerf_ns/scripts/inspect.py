@@ -26,10 +26,10 @@ class Inspect:
     """Folder of the recording. It is only ever read."""
     output: Path | None = None
     """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
+    options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
     run: Path | None = None
     """Run that was trained on the recording, or its config.yml: clock, poses and lens are taken as it refined them, and
     shown beside what was stated."""
-    options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 
     def main(self) -> None:
         data = absolute(self.data)
