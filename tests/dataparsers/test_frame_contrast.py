@@ -11,7 +11,6 @@ from PIL import Image
 from waves import CAMERA, events_of_waves, recording_of
 
 from enerf_ns.dataparsers.frame_contrast import (
-    EXPOSURE_CHANGES,
     exposure_change,
     mean_brightness,
     thresholds_from_frames,
@@ -39,7 +38,7 @@ def test_exposure_that_changes_is_told_and_taken_off(recording: EventRecording, 
     frames = recording.frames
     assert frames is not None
     steady = exposure_change(recording, frames)
-    assert steady is not None and steady < EXPOSURE_CHANGES
+    assert steady is not None and steady < 0.035  # of waves, whose crests all move alike
     gains = np.random.default_rng(1).uniform(0.7, 1.0, len(frames.times))
     names = tuple(tmp_path / name.name for name in frames.filenames)
     for file, name, gain in zip(frames.filenames, names, gains, strict=True):
