@@ -321,11 +321,11 @@ class _Resolver:
     def resolution(self) -> Resolution:
         self._split()
         self._poses()
-        self._pose_noise()
         self._events()
         self._silent_pixels()
         self._sensor()
         self._clock_and_lens()
+        self._pose_noise()
         self._dynamic_range()
         self._frames()
         self._colour()
@@ -401,7 +401,7 @@ class _Resolver:
             return
         pixels = noise.pixels(self.recording.camera.fx, self._distance)
         value = f"{1e3 * noise.position:.2g} mm and {math.degrees(noise.rotation):.2g} degrees are taken off"
-        value += "; what that leaves is refined" * (self.config.poses.refine_drift is not False)
+        value += "; what that leaves is refined" * (self._value("poses.refine_drift") is not False)
         why = f"it moves the picture by {pixels:.2g} pixels"
         self.row("noise of poses", smooth, value * smooth, self.why(name, why), name)
 

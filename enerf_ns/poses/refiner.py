@@ -427,7 +427,7 @@ class PoseRefiner(nn.Module):
         return np.linalg.solve(believed * normal[noise, noise] + np.eye(len(pull)), pull)
 
     def errors_of(self, part: Part) -> Float64[np.ndarray, " numbers"]:
-        """Standard errors of the numbers of a part, in milliseconds, radians, metres or shares, whether it is corrected
+        """Standard errors of the numbers of a part, in the units of `UNITS`, whether it is corrected
         or not; those of the drift are of its coefficients."""
         believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_pixel)
         parts = [other for other in self.parts if other == part or (other in self.corrected and other != "noise")]

@@ -11,7 +11,7 @@ import tyro
 from enerf_ns.dataparsers.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
-from enerf_ns.scripts.format_options import format_flags
+from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 
 @dataclass
@@ -53,6 +53,7 @@ class Convert:
             if self.run is None:
                 sentences = convert_recording(source, output_dir, **chosen)
             else:
+                refuse_beside_run(chosen)
                 sentences = self._convert_refined(self.run, source, output_dir)
         for sentence in sentences:
             print(printable(sentence))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, make_dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Optional, get_type_hints
 
 import tyro
 
+from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.formats.registry import formats
 
 
@@ -57,3 +59,16 @@ def _docstrings(options: type) -> dict[str, str]:
         and isinstance(text, ast.Expr)
         and isinstance(text.value, ast.Constant)
     }
+
+
+def refuse_beside_run(chosen: Iterable[str]) -> None:
+    """Says that a run knows how its recording is read.
+
+    Args:
+        chosen: Names of the options that were given.
+
+    Raises:
+        FlagError: There are some.
+    """
+    for option in chosen:
+        raise FlagError(f"--{option.replace('_', '-')} is taken from the run of --run; leave it out.")

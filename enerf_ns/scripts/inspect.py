@@ -13,7 +13,7 @@ from enerf_ns.dataparsers.errors import OutputError, printable
 from enerf_ns.dataparsers.files import absolute, write_whole
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.inspection import Inspection
-from enerf_ns.scripts.format_options import format_flags
+from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 CONSOLE = Console(width=120)
 
@@ -37,8 +37,11 @@ class Inspect:
         if output.is_dir():
             raise OutputError(f"--output {output} is a folder; give the name of an HTML file.")
         check_outside_recordings("--output", output, data)
-        recording, corrections = read_recording(data, **self.options.given()), None
-        if self.run is not None:
+        corrections, chosen = None, self.options.given()
+        if self.run is None:
+            recording = read_recording(data, **chosen)
+        else:
+            refuse_beside_run(chosen)
             from enerf_ns.report.pose_figure import corrections_over_time  # here, since Nerfstudio takes seconds
             from enerf_ns.report.run_files import refined_recording
 

@@ -20,6 +20,7 @@ from enerf_ns.evaluation.runs import load, method_config, train
 from enerf_ns.export import surface
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.export import Export
+from enerf_ns.scripts.format_options import format_flags
 from enerf_ns.scripts.inspect import Inspect
 
 
@@ -122,6 +123,18 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     assert torch.equal(seen, refined) and not torch.equal(seen, stated)
     again = read_recording(tmp_path / "new").trajectory
     np.testing.assert_allclose(again.poses(torch.from_numpy(times[inside])).numpy(), expected, atol=1e-6)
+
+
+def test_options_of_a_recording_are_none_beside_a_run(run: Path, recording: Path, tmp_path: Path):
+    """Which has read it as it was told."""
+    options = format_flags()(event_camera="left")  # type: ignore
+    for command in (
+        Inspect(recording, tmp_path / "inspect.html", options, run),
+        Convert(recording, tmp_path / "new", options, run),
+    ):
+        with pytest.raises(FlagError, match="--event-camera is taken from the run of --run; leave it out"):
+            command.main()
+    assert not list(tmp_path.iterdir())
 
 
 def test_flags_of_meshes_are_none_of_poses(run: Path, tmp_path: Path):

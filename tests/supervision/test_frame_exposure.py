@@ -44,8 +44,6 @@ def test_all_frames_together_are_exposed_as_the_field_shows():
         exposure.offset.copy_(torch.tensor([0.1, 0.3, 0.1, 0.2, 0.0]))
     shown = torch.full((5, 1), 0.5)
     made = exposure(shown, torch.arange(5))[:, 0]
-    gains = torch.tensor([exposure.at(0)[0]])  # all times are 0: some gain of them
-    assert float(gains) > 0.0
     ratio = (made - (exposure.offset - exposure.offset.mean())) / 0.5
     assert float(ratio.log().mean()) == pytest.approx(0.0, abs=1e-5)
 
