@@ -12,7 +12,7 @@ from typing import get_args
 
 import torch
 
-from enerf_ns.enerf_field import Brightness, brightness_of
+from enerf_ns.rendering.field import Brightness, brightness_of
 from enerf_ns.sensor.response import Response, response_named
 
 STEPS, LEARNING_RATE = 4000, 1e-2

@@ -21,7 +21,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
 
 WIDTH, HEIGHT = 1280, 720
 RATE = 30e6
@@ -63,10 +63,10 @@ def measure(path: Path) -> dict[str, float]:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import torch
 
-    from enerf_ns.dataparsers.camera import Camera
     from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
-    from enerf_ns.dataparsers.recording import EventRecording
-    from enerf_ns.dataparsers.trajectory import Trajectory
+    from enerf_ns.dataparsers.recording.camera import Camera
+    from enerf_ns.dataparsers.recording.recording import EventRecording
+    from enerf_ns.dataparsers.recording.trajectory import Trajectory
     from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
 
     def recording(path: Path) -> EventRecording:

@@ -25,11 +25,11 @@ import torch
 
 from enerf_ns.bench.runner import steps_of
 from enerf_ns.evaluation.history import read_history
-from enerf_ns.evaluation.runs import Run, method_config, set_up, train
+from enerf_ns.method.runs import Run, method_config, set_up, train
+from enerf_ns.method.stopwatch import seconds_of
 from enerf_ns.report.trade_offs import seconds_to_reach
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
-from enerf_ns.stopwatch import seconds_of
 
 WARM_UP, TIMED = 20, 30
 """Steps that are left out, and steps that are timed."""

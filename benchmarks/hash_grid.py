@@ -20,8 +20,8 @@ from typing import Any
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
-from enerf_ns.encodings.hash_grid import BACKENDS, HashGrid
-from enerf_ns.stopwatch import seconds_of
+from enerf_ns.kernels.hash_grid import BACKENDS, HashGrid
+from enerf_ns.method.stopwatch import seconds_of
 
 REPETITIONS = 10
 THEIRS = "Nerfstudio, PyTorch"

@@ -20,7 +20,7 @@ import torch
 
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.events.batch import EventBatch
 from enerf_ns.events.samplers import EventPairSampler, InstantPairSampler
 from enerf_ns.sensor.response import response_named

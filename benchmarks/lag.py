@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.events.samplers import EventPairSampler
 from enerf_ns.sensor.sensor_model import GREY, SensorModelConfig
 from enerf_ns.simulator.engine import simulate

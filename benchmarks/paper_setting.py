@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
-from enerf_ns.enerf_trainer import EnerfTrainer
-from enerf_ns.evaluation.runs import method_config, set_up
 from enerf_ns.evaluation.scores import mean_scores
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.runs import method_config, set_up
+from enerf_ns.method.trainer import EnerfTrainer
 
 LONGER = 10
 """Times as long as the default the setting of the paper may take."""

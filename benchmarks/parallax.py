@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from enerf_ns.dataparsers.depth_range import (
+from enerf_ns.bench.numerics.points import CAMERA, TURNING, noisy, points_between, recording_of_points, shaking
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.dataparsers.scene.depth_range import (
     Parallax,
     measure_parallax,
     measure_share_beyond,
     recording_parallax,
     share_beyond,
 )
-from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.numerics.points import CAMERA, TURNING, noisy, points_between, recording_of_points, shaking
 
 
 def row(name: str, parallax: Parallax, share: float | None) -> None:

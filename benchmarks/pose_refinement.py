@@ -193,9 +193,9 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     from contextlib import redirect_stdout
 
     from enerf_ns.dataparsers.formats.registry import read_recording
-    from enerf_ns.evaluation.runs import method_config, train
     from enerf_ns.evaluation.scores import mean_scores
-    from enerf_ns.evaluation.views import held_out_views
+    from enerf_ns.method.held_out_views import held_out_views
+    from enerf_ns.method.runs import method_config, train
 
     name, seed = cell["recording"], cell["seed"]
     right = right_poses(name, work)
@@ -237,9 +237,9 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
 
 def sharpest(folder: Path) -> dict[str, Any]:
     """Clock and focal length with which events are sharpest, as flags."""
-    from enerf_ns.dataparsers.agreement import clock_and_lens
-    from enerf_ns.dataparsers.depth_range import scene_depth_range
     from enerf_ns.dataparsers.formats.registry import read_recording
+    from enerf_ns.dataparsers.inspection.agreement import clock_and_lens
+    from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 
     recording = read_recording(folder)
     found = clock_and_lens(recording, float(np.sqrt(np.prod(scene_depth_range(recording)))))
@@ -256,7 +256,7 @@ def refine_by_adam() -> None:
     """Has the refiner go down the slope of the squared error of each look by Adam (Kingma and Ba, ICLR 2015)."""
     import torch
 
-    from enerf_ns import enerf_pipeline
+    from enerf_ns.method import pipeline as enerf_pipeline
     from enerf_ns.poses.refiner import PoseRefiner
 
     def solve(self: Any, step: int, may_begin: bool = True) -> bool:

@@ -17,11 +17,11 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from torch import Tensor
 
-from enerf_ns.enerf_model import EnerfModel
 from enerf_ns.evaluation.metrics import psnr
-from enerf_ns.evaluation.runs import load
-from enerf_ns.ray_samplers import PairedProposalSampler
-from enerf_ns.stopwatch import seconds_of
+from enerf_ns.method.model import EnerfModel
+from enerf_ns.method.runs import load
+from enerf_ns.method.stopwatch import seconds_of
+from enerf_ns.rendering.ray_samplers import PairedProposalSampler
 
 REPETITIONS = 7
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from enerf_ns.evaluation.runs import method_config, set_up
+from enerf_ns.method.runs import method_config, set_up
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import tyro
 
-from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.simulator.sampling import adaptive_renders, render_times

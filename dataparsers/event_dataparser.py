@@ -24,16 +24,16 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
-from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
-from enerf_ns.dataparsers.ffmpeg import make_ffmpeg_available
-from enerf_ns.dataparsers.files import write_whole
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
-from enerf_ns.dataparsers.picture_files import write_pictures
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
-from enerf_ns.dataparsers.scene_box import scene_normalisation
+from enerf_ns.dataparsers.index.picture_files import write_pictures
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
+from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
+from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 with warnings.catch_warnings(), suppress(ImportError):  # of which Nerfstudio would show two at each start
     warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.custom_", FutureWarning)

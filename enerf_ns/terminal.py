@@ -15,7 +15,7 @@ from rich.panel import Panel
 from rich.segment import ControlType
 from rich.text import Text
 
-from enerf_ns.dataparsers.errors import printable
+from enerf_ns.dataparsers.recording.errors import printable
 
 REWRITTEN_EVERY, PRINTED_EVERY = 0.25, 30.0
 """Seconds between two states of the line on a terminal, and where lines cannot be rewritten."""

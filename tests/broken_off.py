@@ -29,13 +29,13 @@ from PIL import Image
 from small_runs import set_up, small_config
 from test_interruption import same
 
-from enerf_ns.checkpoints import newest_checkpoint, read_config
-from enerf_ns.dataparsers import index_cache
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.enerf_trainer import EnerfTrainer
+from enerf_ns.dataparsers.index import index_cache
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.evaluation.history import read_history
+from enerf_ns.method.checkpoints import newest_checkpoint, read_config
+from enerf_ns.method.trainer import EnerfTrainer
 from enerf_ns.report import film
 from enerf_ns.scripts import cli
 

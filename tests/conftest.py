@@ -72,7 +72,7 @@ def colour_recording(recording: Path) -> Path:
     import numpy as np
     from PIL import Image
 
-    from enerf_ns.dataparsers.files import load_image
+    from enerf_ns.dataparsers.recording.files import load_image
 
     folder = recording.with_name("colour")
     shutil.copytree(recording, folder)

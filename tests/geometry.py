@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.recording.camera import Camera
 
 
 def world_to_camera(time: int) -> tuple[np.ndarray, np.ndarray]:

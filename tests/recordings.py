@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from enerf_ns.dataparsers.formats import event_recording
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 WIDTH, HEIGHT = 24, 18
 

@@ -10,8 +10,8 @@ import torch
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
-from enerf_ns.enerf_config import enerf
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.method.config import enerf
+from enerf_ns.method.trainer import EnerfTrainerConfig
 
 WIDTH, HEIGHT = 32, 24
 

@@ -13,10 +13,10 @@ from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.inspection import Inspection
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.inspection.page import Inspection
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.method.trainer import EnerfTrainerConfig
 
 HOUR = 3600 * 10**9
 EPOCH = 1_600_000_000_123_456_789

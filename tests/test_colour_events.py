@@ -14,18 +14,19 @@ from nerfstudio.scripts.train import _set_random_seed
 from PIL import Image
 from recordings import joined
 
-from enerf_ns.choices import resolve
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.enerf_config import enerf
-from enerf_ns.enerf_pipeline import EnerfPipelineConfig
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
-from enerf_ns.evaluation.views import aligned_views, held_out_views
+from enerf_ns.evaluation.views import aligned_views
 from enerf_ns.events.batch import TrainBatch
+from enerf_ns.method.config import enerf
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.pipeline import EnerfPipelineConfig
 from enerf_ns.sensor.response import inverse_linlog, linlog
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.supervision.event_supervision import brightness_change

@@ -14,9 +14,9 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, set_up, small_config
 
-from enerf_ns.enerf_config import enerf, enerf_paper
-from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
-from enerf_ns.enerf_model import EnerfModelConfig
+from enerf_ns.method.config import enerf, enerf_paper
+from enerf_ns.method.datamanager import EnerfDataManagerConfig
+from enerf_ns.method.model import EnerfModelConfig
 from enerf_ns.sensor.response import luma
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES, brightness_change
 

@@ -14,14 +14,14 @@ from nerfstudio.utils.eval_utils import eval_setup
 from small_runs import set_up, small_config
 from torch import Tensor, nn
 
-from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.event_dataparser import specification
 from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import read_recording, register
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
 

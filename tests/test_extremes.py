@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from enerf_ns.numerics.all_cases import CASES
-from enerf_ns.numerics.case import Case, as_json, as_markdown, run
+from enerf_ns.bench.numerics.all_cases import CASES
+from enerf_ns.bench.numerics.case import Case, as_json, as_markdown, run
 from enerf_ns.scripts.check_numerics import CheckNumerics
 
 
@@ -44,12 +44,12 @@ def test_a_case_passes_up_to_its_bound_alone(measure, passed: bool):
 
 def test_the_command_writes_both_tables_and_says_what_fails(tmp_path: Path, monkeypatch, capsys):
     cases = [Case("sound", "nothing", 0.0, "", lambda: 0.0), Case("ill", "nothing", 0.0, "", lambda: 1.0)]
-    monkeypatch.setattr("enerf_ns.numerics.all_cases.CASES", cases)
+    monkeypatch.setattr("enerf_ns.bench.numerics.all_cases.CASES", cases)
     with pytest.raises(SystemExit, match=r"enerf: 1 of 2 cases fail: ill\."):
         CheckNumerics(tmp_path / "numerics").main()
     stored = json.loads((tmp_path / "numerics/numerics.json").read_text())
     assert [result["passed"] for result in stored] == [True, False]
     assert (tmp_path / "numerics/numerics.md").read_text().count("\n") == 4
     assert "2 cases" in capsys.readouterr().out
-    monkeypatch.setattr("enerf_ns.numerics.all_cases.CASES", cases[:1])
+    monkeypatch.setattr("enerf_ns.bench.numerics.all_cases.CASES", cases[:1])
     CheckNumerics().main()

@@ -17,8 +17,8 @@ from nerfstudio.scripts.train import main
 from nerfstudio.utils import writer
 from small_runs import set_up, small_config
 
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
-from enerf_ns.error_against_time import ErrorAgainstTime
+from enerf_ns.method.error_against_time import ErrorAgainstTime
+from enerf_ns.method.trainer import EnerfTrainerConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -14,9 +14,9 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from small_runs import set_up, small_config
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from enerf_ns.enerf_pipeline import LAG_TOLD_AFTER
 from enerf_ns.events.batch import TrainBatch
-from enerf_ns.ray_samplers import paired_rand
+from enerf_ns.method.pipeline import LAG_TOLD_AFTER
+from enerf_ns.rendering.ray_samplers import paired_rand
 from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.supervision.losses import huber_event_loss
 
@@ -166,7 +166,7 @@ print(*[name for name in {UNUSED!r} if name in sys.modules])
 
 UNUSED = (
     "hdf5plugin", "rosbags", "trimesh", "enerf_ns.simulator.engine", "enerf_ns.report",
-    "enerf_ns.dataparsers.inspection", "enerf_ns.numerics", "torchmetrics.image.lpip",
+    "enerf_ns.dataparsers.inspection.page", "enerf_ns.bench.numerics", "torchmetrics.image.lpip",
 )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from enerf_ns.guarded_steps import Later
+from enerf_ns.method.guarded_steps import Later
 
 READING = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "unique_consecutive", "_unique2"}
 """Operations that wait for values, or for the shape that depends on them."""

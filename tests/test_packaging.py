@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from enerf_ns.published_losses import PUBLISHED_LOSSES
+from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 ROOT = Path(__file__).parents[1]
 SPECIFICATIONS = {
@@ -28,7 +28,7 @@ MODULES = sorted(
 WITHOUT_NERFSTUDIO = [
     module
     for module in MODULES
-    if module.startswith(("enerf_ns.encodings", "enerf_ns.simulator", "enerf_ns.dataparsers"))
+    if module.startswith(("enerf_ns.kernels.hash_grid", "enerf_ns.simulator", "enerf_ns.dataparsers"))
     and module != "enerf_ns.dataparsers.event_dataparser"
 ] + ["enerf_ns.events.samplers", "enerf_ns.sensor.response", "enerf_ns.supervision.losses"]
 

@@ -13,16 +13,16 @@ from recordings import changed, joined, write_event_recording
 from rich.console import Console
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
+from enerf_ns.choices.table import recording_table
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, split_frames
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.inspection import Inspection
-from enerf_ns.dataparsers.problems import find_problems
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.scene_box import scene_normalisation
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.tables import recording_table
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.inspection.page import Inspection
+from enerf_ns.dataparsers.inspection.problems import find_problems
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 CUT = 900_000_000, 1_900_000_000
 

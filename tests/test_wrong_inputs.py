@@ -30,7 +30,7 @@ import test_tum_vie
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
 
-from enerf_ns.dataparsers.errors import printable
+from enerf_ns.dataparsers.recording.errors import printable
 
 Fault = Callable[[Path], object]
 
@@ -504,9 +504,9 @@ def test_what_the_user_may_not_touch_is_told_in_one_sentence(name: str, home: Pa
 INDEX_IN_THE_CACHE = """
 import pwd
 pwd.getpwuid = lambda number: {}[number]  # a user whom the system has no entry of
-from enerf_ns.dataparsers import index_cache
+from enerf_ns.dataparsers.index import index_cache
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
 index_cache.CACHED_FROM = 1
 print(*index_events(read_recording("recording")).notes)
 """

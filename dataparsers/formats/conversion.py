@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from enerf_ns.dataparsers.errors import OutputError, RecordingError
-from enerf_ns.dataparsers.files import partial_of, read_json, write_whole
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
+from enerf_ns.dataparsers.recording.files import partial_of, read_json, write_whole
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 
 def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, image_size, of_file, reading
+from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import check_image_size, image_size, of_file, reading
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events.txt", "groundtruth.txt", "calib.txt")
 

@@ -32,9 +32,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from enerf_ns.dataparsers.camera import Camera, CameraModel, check_rotation
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import (
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
+from enerf_ns.dataparsers.formats.json_values import parse_array
+from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
+from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
+from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import (
     check_image_size,
     check_is_folder,
     in_colour,
@@ -42,13 +47,8 @@ from enerf_ns.dataparsers.files import (
     read_json,
     read_text,
 )
-from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
-from enerf_ns.dataparsers.formats.json_values import parse_array
-from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
-from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
 

@@ -21,9 +21,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import check_is_folder, in_colour, load_array, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
@@ -38,8 +35,11 @@ from enerf_ns.dataparsers.formats.writer import (
     encode_poses,
     poses_at,
 )
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import check_is_folder, in_colour, load_array, of_file, read_json
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
 

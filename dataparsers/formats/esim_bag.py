@@ -24,9 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import of_file, read_text, reading
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.json_values import shown
 from enerf_ns.dataparsers.formats.robust_enerf import (
@@ -36,8 +33,11 @@ from enerf_ns.dataparsers.formats.robust_enerf import (
     read_views,
     whole_nanoseconds,
 )
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import of_file, read_text, reading
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("esim.bag", "esim.conf")
 

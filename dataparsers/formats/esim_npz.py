@@ -30,9 +30,6 @@ from zipfile import ZipFile
 import numpy as np
 from jaxtyping import Int, Int64
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import of_file, reading
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.robust_enerf import (
     LATEST,
@@ -42,8 +39,11 @@ from enerf_ns.dataparsers.formats.robust_enerf import (
     read_views,
     whole_nanoseconds,
 )
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import of_file, reading
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
 

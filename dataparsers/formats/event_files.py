@@ -21,9 +21,9 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import reading
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import reading
+from enerf_ns.dataparsers.recording.recording import Events
 
 BYTES_AT_A_TIME = 2**18
 """Bytes that are read at once; a vector word of two bytes may hold twelve events."""

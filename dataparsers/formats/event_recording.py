@@ -30,17 +30,6 @@ from jaxtyping import Float64, Int64
 from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers.camera import COEFFICIENTS, Camera, check_rotation
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import (
-    check_is_folder,
-    is_deep,
-    load_array,
-    load_image,
-    of_file,
-    read_json,
-    write_whole,
-)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
 from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
@@ -58,8 +47,19 @@ from enerf_ns.dataparsers.formats.writer import (
     is_second_camera,
     mounted_camera_json,
 )
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import COEFFICIENTS, Camera, check_rotation
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import (
+    check_is_folder,
+    is_deep,
+    load_array,
+    load_image,
+    of_file,
+    read_json,
+    write_whole,
+)
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 

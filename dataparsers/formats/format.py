@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from enerf_ns.dataparsers.formats.writer import Writer
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 
 @dataclass(frozen=True)

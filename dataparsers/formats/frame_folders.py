@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_image_size, check_is_folder, load_array, of_file
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows, read_times
-from enerf_ns.dataparsers.recording import LONGEST_EXPOSURE, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import check_image_size, check_is_folder, load_array, of_file
+from enerf_ns.dataparsers.recording.recording import LONGEST_EXPOSURE, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 
 def read_frames(

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32
 
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import reading, write_all
-from enerf_ns.dataparsers.recording import EVENTS_AT_A_TIME, Events
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import reading, write_all
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
 
 if TYPE_CHECKING:
     import h5py

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 LONGEST = 60
 """Most letters of a value that an error shows."""

@@ -11,12 +11,12 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.files import absolute, of_file
 from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.recording.files import absolute, of_file
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
 

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera, check_rotation
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import check_is_folder, image_size, of_file, read_json
 from enerf_ns.dataparsers.formats.json_values import parse_array
 from enerf_ns.dataparsers.formats.text_tables import FARTHEST, QUATERNION_TOLERANCE
-from enerf_ns.dataparsers.recording import Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import check_is_folder, image_size, of_file, read_json
+from enerf_ns.dataparsers.recording.recording import Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 SHORTEST_STEP = 1000
 """Least nanoseconds between poses. ESIM states poses at the times of its inertial sensor and of its images, which may

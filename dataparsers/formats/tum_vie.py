@@ -45,9 +45,6 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import check_is_folder, image_size, of_file, read_json
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
 from enerf_ns.dataparsers.formats.text_tables import (
@@ -58,8 +55,11 @@ from enerf_ns.dataparsers.formats.text_tables import (
     read_times,
 )
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json, encode_poses, poses_at
-from enerf_ns.dataparsers.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import check_is_folder, image_size, of_file, read_json
+from enerf_ns.dataparsers.recording.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/mocap_data.txt", "calib_undist.json")
 

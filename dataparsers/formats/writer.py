@@ -32,11 +32,11 @@ import torch
 from jaxtyping import Float, Float32, Float64, Int64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera, check_rotation
-from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import write_all, write_together
-from enerf_ns.dataparsers.recording import Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError
+from enerf_ns.dataparsers.recording.files import write_all, write_together
+from enerf_ns.dataparsers.recording.recording import Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 CAMERA_KEYS = ("width", "height", "model", "fx", "fy", "cx", "cy")
 MOUNTING_KEY = "event_camera_from_frame_camera"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from enerf_ns.bench import published
 from enerf_ns.bench.experiment import Experiment, Row, Sequence
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED, REAL
-from enerf_ns.paper_selections import SPIRAL_1
-from enerf_ns.published_losses import PUBLISHED_LOSSES
+from enerf_ns.choices.presets import SPIRAL_1
+from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 if TYPE_CHECKING:
     from enerf_ns.simulator.event_sensor import SensorSettings

@@ -13,17 +13,18 @@ import numpy as np
 import torch
 
 from enerf_ns.bench.experiments import NEAR
-from enerf_ns.enerf_pipeline import EnerfPipeline
 from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.metrics import depth_rmse
-from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import NotScored, mean_scores
-from enerf_ns.evaluation.views import HeldOutView, aligned_views, expected_brightness_scale, held_out_views
-from enerf_ns.event_dataset import EventDataset
-from enerf_ns.memory import kept_bytes
+from enerf_ns.evaluation.views import HeldOutView, aligned_views
+from enerf_ns.method.event_dataset import EventDataset
+from enerf_ns.method.held_out_views import expected_brightness_scale, held_out_views
+from enerf_ns.method.memory import kept_bytes
+from enerf_ns.method.pipeline import EnerfPipeline
+from enerf_ns.method.runs import Run
+from enerf_ns.method.stopwatch import seconds_of
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.simulator.event_sensor import SensorSettings
-from enerf_ns.stopwatch import seconds_of
 
 REPEATS = 9
 """How often each part of a step is timed; what is told is the median."""

@@ -26,19 +26,19 @@ import enerf_ns
 from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
 from enerf_ns.bench.measures import TRUTH, evaluate
+from enerf_ns.bench.numerics.parts import error_of_parts
 from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.bench.tables import csv_table, lines, markdown
-from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import absolute, expanded, partial_of, read_json, write_whole
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
-from enerf_ns.enerf_trainer import EnerfTrainerConfig
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError
+from enerf_ns.dataparsers.recording.files import absolute, expanded, partial_of, read_json, write_whole
 from enerf_ns.evaluation.lpips import NETWORKS, Net
-from enerf_ns.evaluation.runs import method_config, set_up, train
-from enerf_ns.numerics.parts import error_of_parts
+from enerf_ns.method.runs import method_config, set_up, train
+from enerf_ns.method.stopwatch import seconds_of
+from enerf_ns.method.trainer import EnerfTrainerConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings
-from enerf_ns.stopwatch import seconds_of
 
 FULL_SIZE = (640, 480)
 """Width and height of the simulated sequences at scale 1, pixels."""

@@ -13,8 +13,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from enerf_ns.bench.numerics.case import shown
 from enerf_ns.bench.published import MEAN
-from enerf_ns.numerics.case import shown
 
 Results = dict[str, Any]
 """What a result file holds (`Bench.results`)."""

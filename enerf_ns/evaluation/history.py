@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from enerf_ns.dataparsers.files import write_together, write_whole
+from enerf_ns.dataparsers.recording.files import write_together, write_whole
 
 if TYPE_CHECKING:
     from enerf_ns.evaluation.scores import NotScored

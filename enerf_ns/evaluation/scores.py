@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from enerf_ns.evaluation.lpips import NETWORKS, Net, lpips
 from enerf_ns.evaluation.metrics import KNOWN, Score, correlation, depth_rmse, is_known, psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PROTOCOLS
-from enerf_ns.evaluation.views import EXPECTED_SCALE, HeldOutView, RenderingPipeline, aligned_views, held_out_views
-from enerf_ns.poses.corrections import Corrections
+from enerf_ns.evaluation.views import EXPECTED_SCALE, HeldOutView, aligned_views
 
 NotScored = dict[str, dict[str, list[int]]]
 """What has no value: by score and reason, the numbers of the held-out frames, from 0; none of a score of the whole
@@ -158,20 +156,3 @@ def summary_scores(
         else:
             scores[name] = value
     return scores | ({"not_scored": not_scored} if not_scored else {})
-
-
-def scores_at_stated_poses(pipeline: RenderingPipeline) -> dict[str, float]:
-    """psnr, ssim and event_correlation of a run at the poses of its recording as they were stated, where they were
-    corrected: what correcting them is worth. Those that there are."""
-    manager = pipeline.datamanager
-    corrected = manager.corrections
-    manager.correct(Corrections())
-    try:
-        views, _ = held_out_views(pipeline, evidence=False)
-        scores: dict[str, Any] = dict(pipeline.event_scores())
-    finally:
-        manager.correct(corrected)
-    if any(view.recorded is not None for view in views):
-        scores |= mean_scores(views, False, DEFAULT_PROTOCOL, ())[0]
-    names = ("psnr", "ssim", "event_correlation")
-    return {name: float(scores[name]) for name in names if isinstance(scores.get(name), float)}

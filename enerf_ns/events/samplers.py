@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
-from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.events.batch import EventBatch
 
 MOST_DRAWS = 64

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from enerf_ns.dataparsers.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_index import EventIndex
 
 BORDER = 1 / 16
 """Width of a sensor's border, as a share of its width and height."""

@@ -12,8 +12,8 @@ import trimesh
 from jaxtyping import Float, Float64
 from scipy.spatial import KDTree
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.files import read_json
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.files import read_json
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import Scene

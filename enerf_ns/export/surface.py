@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.method.pipeline import EnerfPipeline
 from enerf_ns.poses.posed_camera import PosedCamera
-from enerf_ns.spread_depth import depth_evidence
+from enerf_ns.rendering.spread_depth import depth_evidence
 
 NUM_VIEWS = 40
 """Views, spread evenly over the trajectory, that are fused."""

@@ -11,9 +11,9 @@ from jaxtyping import Float64, Int64
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 MILLISECOND = 1_000_000
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import evenly_spaced
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
 from enerf_ns.poses.corrections import Corrections, Drift
 from enerf_ns.poses.refiner import TOLD, Part, PoseRefiner
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from enerf_ns.dataparsers.recording import Frames
+from enerf_ns.dataparsers.recording.recording import Frames
 
 STEPS = 8
 """Parts of each exposure, within which motion is taken to be straight."""

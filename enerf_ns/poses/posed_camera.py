@@ -11,9 +11,9 @@ from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.precision import full_precision
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.kernels.precision import full_precision
 
 
 class PosedCamera:

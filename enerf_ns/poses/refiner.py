@@ -7,24 +7,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Optional
+from typing import Any, Optional, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.fields.base_field import Field
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis
-
-if TYPE_CHECKING:
-    from enerf_ns.enerf_model import EnerfModel
 
 Part = str
 """Something that may be wrong: clock, rate (of the clock), rotation (of the mount), translation (of it), lens, drift,
@@ -544,8 +542,20 @@ class Slopes:
     """With each of the shapes by which the scene may bend."""
 
 
+class SampledModel(Protocol):
+    """A model whose field is rendered at samples along rays."""
+
+    collider: Any
+    gain: float
+
+    @property
+    def field(self) -> Field: ...
+
+    def _samples(self, rays: RayBundle) -> tuple[RaySamples, list[Tensor], list[RaySamples]]: ...
+
+
 def render_slopes(
-    model: EnerfModel,
+    model: SampledModel,
     rays: RayBundle,
     seen: Callable[[Tensor], Tensor],
     axes: Float[Tensor, "rays 3 3"],

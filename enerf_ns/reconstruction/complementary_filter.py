@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.compiled import compiled
+from enerf_ns.dataparsers.recording.recording import Events
 
 
 class ComplementaryFilter:

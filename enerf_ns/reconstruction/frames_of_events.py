@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.reconstruction.networks import Network, State
 from enerf_ns.reconstruction.voxel_grid import normalised, voxel_grid
 

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import reading
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import reading
 
 State = tuple[Tensor, ...]
 """What a recurrent layer remembers, each [batch, channels, height, width]; the first is its output too."""

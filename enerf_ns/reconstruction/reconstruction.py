@@ -13,13 +13,13 @@ from jaxtyping import Float32, Int64
 from PIL import Image
 from rich.progress import track
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import of_file
 from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.sensor_estimates import ASSUMED_THRESHOLD
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import of_file
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.sensor_estimates.estimates import ASSUMED_THRESHOLD
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
 from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, reconstruct_frames
 from enerf_ns.reconstruction.networks import load_network

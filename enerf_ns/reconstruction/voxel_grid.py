@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.recording import Events
 
 
 def voxel_grid(events: Events, num_bins: int, width: int, height: int) -> Float32[Tensor, "num_bins height width"]:

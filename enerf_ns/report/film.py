@@ -21,13 +21,13 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.event_index import OFF_COLOUR, ON_COLOUR, event_picture
-from enerf_ns.dataparsers.files import partial_of, write_whole
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.enerf_pipeline import EnerfPipeline
+from enerf_ns.dataparsers.index.event_index import OFF_COLOUR, ON_COLOUR, event_picture
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.files import partial_of, write_whole
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Correction
 from enerf_ns.evaluation.views import HeldOutView
+from enerf_ns.method.pipeline import EnerfPipeline
 
 MIDDLE_GREY = 0.5
 """What the median brightness is shown as, where the screen's gamma suffices for that."""

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
-from enerf_ns.dataparsers.files import in_colour
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.picture_depth import brightness
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory, evenly_spaced
+from enerf_ns.dataparsers.index.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.files import in_colour
+from enerf_ns.dataparsers.recording.picture_depth import brightness
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 from enerf_ns.evaluation.metrics import KNOWN, is_known
 from enerf_ns.evaluation.views import HeldOutView
 

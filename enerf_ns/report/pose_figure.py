@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.report.figures import COLOURS, GREY, WIDTH
 
 if TYPE_CHECKING:

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from enerf_ns.checkpoints import newest_checkpoint, read_config
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import absolute, expanded, reading
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
+from enerf_ns.method.checkpoints import newest_checkpoint, read_config
 
 if TYPE_CHECKING:
-    from enerf_ns.dataparsers.recording import EventRecording
-    from enerf_ns.enerf_trainer import EnerfTrainerConfig
+    from enerf_ns.dataparsers.recording.recording import EventRecording
+    from enerf_ns.method.trainer import EnerfTrainerConfig
 
 RECENT_SECONDS = 600.0
 """Age (s) of the newest file that training wrote, up to which a run that is not at its end counts as still going."""
@@ -141,7 +141,7 @@ def refined_recording(run: Path, data: Path) -> EventRecording:
         RecordingError: It is no run, or has no whole checkpoint.
         FlagError: It was trained on another recording.
     """
-    from enerf_ns.evaluation.runs import load  # here, since PyTorch and Nerfstudio take seconds
+    from enerf_ns.method.runs import load  # here, since PyTorch and Nerfstudio take seconds
 
     files = read_run(run)
     if not files.stored:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 

@@ -14,16 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from enerf_ns.dataparsers.depth_range import scene_depth_range
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError, quoted
-from enerf_ns.dataparsers.files import fill_page, write_together
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
+from enerf_ns.dataparsers.recording.files import fill_page, write_together
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
-from enerf_ns.evaluation.runs import Run, load
-from enerf_ns.evaluation.scores import scores_at_stated_poses, summary_scores
-from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views, held_out_views
+from enerf_ns.evaluation.scores import summary_scores
+from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views
+from enerf_ns.method.held_out_views import held_out_views, scores_at_stated_poses
+from enerf_ns.method.runs import Run, load
 from enerf_ns.poses.findings import findings
 from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
 from enerf_ns.report.film import Screen, render_moving, render_video

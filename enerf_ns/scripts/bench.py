@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.dataparsers.errors import FlagError, printable
+from enerf_ns.dataparsers.recording.errors import FlagError, printable
 
 CONSOLE = Console(width=140)
 

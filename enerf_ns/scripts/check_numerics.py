@@ -10,11 +10,11 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.files import write_together
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.files import write_together
 
 if TYPE_CHECKING:
-    from enerf_ns.numerics.case import Result
+    from enerf_ns.bench.numerics.case import Result
 
 
 @dataclass
@@ -27,9 +27,9 @@ class CheckNumerics:
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
 
+        from enerf_ns.bench.numerics.all_cases import CASES
+        from enerf_ns.bench.numerics.case import as_json, as_markdown, run
         from enerf_ns.dataparsers.formats.registry import check_outside_recordings
-        from enerf_ns.numerics.all_cases import CASES
-        from enerf_ns.numerics.case import as_json, as_markdown, run
 
         if self.output_dir is not None:
             check_outside_recordings("--output-dir", self.output_dir)
@@ -50,7 +50,7 @@ class CheckNumerics:
 
 def results_table(results: list[Result]) -> Table:
     """The results for the terminal."""
-    from enerf_ns.numerics.case import shown
+    from enerf_ns.bench.numerics.case import shown
 
     seconds = sum(result.seconds for result in results)
     table = Table(

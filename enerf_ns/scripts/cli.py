@@ -11,7 +11,7 @@ from importlib import import_module
 import tyro
 
 from enerf_ns import __version__
-from enerf_ns.dataparsers.errors import exit_with_a_sentence, printable
+from enerf_ns.dataparsers.recording.errors import exit_with_a_sentence, printable
 from enerf_ns.quiet import silence_known_warnings
 
 COMMANDS = {

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError, printable
-from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable
+from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from enerf_ns.dataparsers.errors import printable
-from enerf_ns.dataparsers.files import absolute
+from enerf_ns.dataparsers.recording.errors import printable
+from enerf_ns.dataparsers.recording.files import absolute
 
 
 @dataclass
@@ -21,9 +21,9 @@ class Demo:
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
 
+        from enerf_ns.choices.ranges import check_ranges
         from enerf_ns.dataparsers.formats.registry import check_outside_recordings
-        from enerf_ns.evaluation.runs import method_config, train
-        from enerf_ns.ranges import check_ranges
+        from enerf_ns.method.runs import method_config, train
         from enerf_ns.report.writing import write_report
         from enerf_ns.scripts.simulate import Simulate
         from enerf_ns.simulator.settings import SimulationSettings

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads the
 import numpy as np
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError, printable
-from enerf_ns.dataparsers.files import absolute, expanded, write_together
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, printable
+from enerf_ns.dataparsers.recording.files import absolute, expanded, write_together
 
 if TYPE_CHECKING:
-    from enerf_ns.enerf_pipeline import EnerfPipeline
+    from enerf_ns.method.pipeline import EnerfPipeline
 
 SUFFIXES = (".ply", ".glb")
 POSE_SUFFIXES = (".txt",)
@@ -47,9 +47,9 @@ class Export:
     """Mesh that the result is scored against, in metres, in the axes of the recording. None: the simulated scene."""
 
     def main(self) -> None:
-        from enerf_ns.evaluation.runs import load
         from enerf_ns.export.scoring import simulated_scene, surface_scores
         from enerf_ns.export.surface import fused, pixel_size, points_of, surface_views
+        from enerf_ns.method.runs import load
         from enerf_ns.report.run_files import read_run
         from enerf_ns.simulator.scene.scene_files import load_scene
 

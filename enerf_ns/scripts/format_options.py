@@ -12,8 +12,8 @@ from typing import Annotated, Any, Optional, get_type_hints
 
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.formats.registry import formats
+from enerf_ns.dataparsers.recording.errors import FlagError
 
 
 @dataclass

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from enerf_ns.dataparsers.errors import OutputError, printable
-from enerf_ns.dataparsers.files import absolute, write_whole
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
-from enerf_ns.dataparsers.inspection import Inspection
+from enerf_ns.dataparsers.inspection.page import Inspection
+from enerf_ns.dataparsers.recording.errors import OutputError, printable
+from enerf_ns.dataparsers.recording.files import absolute, write_whole
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 CONSOLE = Console(width=120)

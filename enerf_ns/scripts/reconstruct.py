@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from enerf_ns.dataparsers.errors import RecordingError, printable, quoted
-from enerf_ns.dataparsers.files import absolute, expanded
+from enerf_ns.dataparsers.recording.errors import RecordingError, printable, quoted
+from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.reconstruction.reconstruction import reconstruct
 from enerf_ns.scripts.format_options import format_flags
 

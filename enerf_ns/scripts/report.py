@@ -8,8 +8,8 @@ from typing import Annotated, Optional  # tyro reads these annotations on Python
 
 import tyro
 
-from enerf_ns.dataparsers.errors import printable
-from enerf_ns.dataparsers.files import absolute
+from enerf_ns.dataparsers.recording.errors import printable
+from enerf_ns.dataparsers.recording.files import absolute
 from enerf_ns.report.scoring import Scoring
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Optional  # tyro reads these annotations on Python
 
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError, printable, quoted
+from enerf_ns.dataparsers.recording.errors import FlagError, printable, quoted
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings

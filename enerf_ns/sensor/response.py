@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from enerf_ns.precision import full_precision
+from enerf_ns.kernels.precision import full_precision
 
 LINEAR_UNTIL = 20.0
 """Brightness (of 255) below which linlog is linear, and above which it is logarithmic; B of the E-NeRF paper."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
-from enerf_ns.precision import full_precision
+from enerf_ns.kernels.precision import full_precision
 
 SOLVED_EVERY = 50
 """Observations from one time that the map is solved to the next."""

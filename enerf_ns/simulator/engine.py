@@ -16,11 +16,11 @@ from jaxtyping import Float, Int64
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError
-from enerf_ns.dataparsers.files import absolute, remove_leftovers
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, open_writer, writer_of
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError
+from enerf_ns.dataparsers.recording.files import absolute, remove_leftovers
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.sensor.response import ColourFilter, luma, pixel_brightness, response_named
 from enerf_ns.simulator.event_sensor import EventSensor
 from enerf_ns.simulator.frames import Exposures, Frame, develop

@@ -32,9 +32,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int64
 
-from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording import CONTRAST_THRESHOLD_LIMITS, Events
+from enerf_ns.dataparsers.compiled import compiled
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, Events
 from enerf_ns.sensor.response import LINEAR_UNTIL, Gamma, Logarithm, response_named
 
 READOUT_QUEUE = 1000

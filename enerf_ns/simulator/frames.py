@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.recording.errors import FlagError
 
 MOST_LEVEL = 1e6
 """Brightness, as a multiple of what is white, above which pixels have the noise of this brightness."""

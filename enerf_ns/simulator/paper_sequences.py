@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.simulator.trajectories import MOTIONS
 
 

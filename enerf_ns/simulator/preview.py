@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.files import in_colour, partial_of
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.files import in_colour, partial_of
+from enerf_ns.dataparsers.recording.recording import Events
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
 """Colours (R G B) of pixels whose latest event was off, that had none, and whose latest was on."""

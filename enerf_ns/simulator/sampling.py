@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import Logarithm, Response
 from enerf_ns.simulator.event_sensor import PartialPicture
 

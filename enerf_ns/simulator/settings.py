@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads the
 
 import tyro
 
-from enerf_ns.dataparsers.errors import FlagError
-from enerf_ns.dataparsers.files import expanded
 from enerf_ns.dataparsers.formats.registry import layouts, writer_of
+from enerf_ns.dataparsers.recording.errors import FlagError
+from enerf_ns.dataparsers.recording.files import expanded
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
 from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset

@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float, Float32, Int64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import image_size, load_image
 from enerf_ns.dataparsers.formats.text_tables import read_times
-from enerf_ns.dataparsers.picture_depth import brightness, find_white_level
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.evaluation.runs import load_any_method
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import image_size, load_image
+from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.runs import load_any_method
 from enerf_ns.sensor.response import Logarithm, Response
 
 if TYPE_CHECKING:

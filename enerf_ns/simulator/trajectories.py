@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.text_tables import FARTHEST, parse_numbers, parse_times, read_poses, read_rows
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 POSES_PER_SECOND = 1000
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.files import absolute, expanded
 from enerf_ns.dataparsers.formats.event_recording import read_cameras
 from enerf_ns.dataparsers.formats.registry import writer_of
 from enerf_ns.dataparsers.formats.writer import is_second_camera
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import absolute, expanded
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.paper_sequences import PRESETS
 from enerf_ns.simulator.scene.render import Renderer

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from enerf_ns.events.batch import EventBatch
-from enerf_ns.precision import full_precision
+from enerf_ns.kernels.precision import full_precision
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.losses import (
     huber_event_loss,

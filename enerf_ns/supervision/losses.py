@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from enerf_ns.precision import full_precision
+from enerf_ns.kernels.precision import full_precision
 from enerf_ns.sensor.response import luma
 
 

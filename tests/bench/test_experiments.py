@@ -14,8 +14,8 @@ from enerf_ns.bench.measures import MEASURES
 from enerf_ns.bench.published import MEAN
 from enerf_ns.bench.tables import LOWER_IS_BETTER
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED, REAL
-from enerf_ns.evaluation.runs import method_config
-from enerf_ns.paper_selections import PRESETS
+from enerf_ns.choices.presets import PRESETS
+from enerf_ns.method.runs import method_config
 from enerf_ns.simulator import paper_sequences
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.scenes import SCENES

@@ -24,12 +24,12 @@ from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
 from enerf_ns.bench.measures import MEASURES, TRUTH, evaluate, milliseconds_a_step
 from enerf_ns.bench.runner import Bench, parse_budget, steps_of
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.dataparsers.errors import FlagError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.enerf_trainer import EnerfTrainer
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.evaluation.metrics import depth_rmse
-from enerf_ns.evaluation.runs import load, method_config
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.runs import load, method_config
+from enerf_ns.method.trainer import EnerfTrainer
 from enerf_ns.scripts.bench import Bench as BenchCommand
 from enerf_ns.sensor.threshold_map import ThresholdMap
 from enerf_ns.simulator.engine import simulate

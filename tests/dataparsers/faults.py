@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 KINDS = ("frames", "blurred_frames")
 

@@ -18,8 +18,6 @@ from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, poses, wr
 from scipy.interpolate import CubicSpline
 
 from enerf_ns.dataparsers import event_dataparser
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError, exit_with_a_sentence
 from enerf_ns.dataparsers.event_dataparser import (
     EventDataParserConfig,
     split_frames,
@@ -27,11 +25,13 @@ from enerf_ns.dataparsers.event_dataparser import (
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
-from enerf_ns.event_dataset import EventDataset
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.datamanager import EnerfDataManagerConfig
+from enerf_ns.method.event_dataset import EventDataset
 from enerf_ns.poses.posed_camera import PosedCamera
 
 NEAR, FAR = 0.5, 4.0

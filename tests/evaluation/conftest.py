@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from small_runs import SMALL
 
-from enerf_ns.evaluation.runs import Run, method_config, train
+from enerf_ns.method.runs import Run, method_config, train
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from small_runs import set_up, small_config
 
-from enerf_ns.evaluation.held_out_poses import CLOSE, held_out_numbers, nearest_poses, on_path
+from enerf_ns.method.held_out_poses import CLOSE, held_out_numbers, nearest_poses, on_path
 
 
 def poses(positions: np.ndarray, turns: np.ndarray) -> np.ndarray:

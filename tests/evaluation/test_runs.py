@@ -10,9 +10,9 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.scripts.train import train_loop
 from small_runs import SMALL
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.evaluation import runs
-from enerf_ns.evaluation.runs import Run, load, method_config, set_up
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.method import runs
+from enerf_ns.method.runs import Run, load, method_config, set_up
 
 
 def parameters(pipeline: torch.nn.Module) -> dict[str, torch.Tensor]:

@@ -10,13 +10,14 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.evaluation import scores
 from enerf_ns.evaluation.metrics import correlation, depth_rmse, psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, align, described
-from enerf_ns.evaluation.runs import Run
 from enerf_ns.evaluation.scores import mean_scores, summary_scores, view_scores
-from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_views
+from enerf_ns.evaluation.views import HeldOutView, aligned_views
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.runs import Run
 
 NO_LPIPS = "the frame is smaller than 31 x 31 pixels"
 

@@ -10,13 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.evaluation.runs import Run
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.files import load_array, load_image
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import HeldOutView, aligned_views, held_out_view, held_out_views, save_pictures
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, save_pictures
 from enerf_ns.events.batch import EventBatch
+from enerf_ns.method.held_out_views import held_out_view, held_out_views
+from enerf_ns.method.runs import Run
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 METRES = 2.5

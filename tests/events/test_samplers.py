@@ -12,8 +12,8 @@ import torch
 from scipy.optimize import root_scalar
 from scipy.stats import chisquare
 
-from enerf_ns.dataparsers.event_index import EventIndex
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.events import samplers as event_sampler
 from enerf_ns.events.batch import EventBatch
 from enerf_ns.events.samplers import (

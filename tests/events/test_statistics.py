@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns.dataparsers.event_index import EventIndex
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.events.statistics import border_rate, log_brightness_range, silent_share
 from enerf_ns.sensor.response import Linlog
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 import trimesh
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.files import load_array
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.files import load_array
 from enerf_ns.export.scoring import distances, seen_points, simulated_scene, surface_scores
 from enerf_ns.simulator.scene.scenes import Surface, build_scene
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.export.surface import SurfaceView, colours_of, fused, pixel_size, points_of, surface_views
 
 CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)

@@ -11,9 +11,9 @@ from scipy.integrate import trapezoid
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis, poses_at
 
 CAMERA = Camera(24, 18, 20.0, 22.0, 11.0, 9.5)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.recording import Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.motion import exposure_motion
 
 CAMERA = Camera(41, 31, 50.0, 60.0, 20.0, 15.0)

@@ -9,8 +9,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.posed_camera import PosedCamera
 
 CAMERA = Camera(24, 18, 20.0, 22.0, 11.0, 9.5)

@@ -17,12 +17,12 @@ from recordings import write_event_recording
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.recording import EventRecording
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.runs import method_config, train
 from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.findings import findings, picture_shift
 from enerf_ns.poses.posed_camera import PosedCamera

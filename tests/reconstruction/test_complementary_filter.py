@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
 
 ZERO = 1_700_000_000_123_456_789

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recordings import joined as joined_stream
 
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
 from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, Reconstruction, reconstruct_frames, split_at
 from enerf_ns.reconstruction.networks import FireNet, load_network

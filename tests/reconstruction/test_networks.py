@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.reconstruction.networks import E2VID, ConvGRU, ConvLSTM, FireNet, Residual, load_network
 
 

@@ -13,10 +13,10 @@ from recordings import joined, write_davis, write_esim, write_image
 from small_runs import check_two_steps, small_config
 from test_event_recording import MOUNTING, write_recording
 
-from enerf_ns.dataparsers.errors import OutputError, UserError
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats.conversion import convert_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.errors import OutputError, UserError
+from enerf_ns.dataparsers.recording.files import load_image
 from enerf_ns.reconstruction import reconstruction
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
 from enerf_ns.reconstruction.frames_of_events import reconstruct_frames

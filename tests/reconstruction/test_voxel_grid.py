@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.reconstruction.voxel_grid import normalised, voxel_grid
 
 

@@ -14,9 +14,10 @@ import torch
 from matplotlib import colormaps
 from PIL import Image
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.evaluation.runs import Run
-from enerf_ns.evaluation.views import HeldOutView, held_out_views
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.evaluation.views import HeldOutView
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.runs import Run
 from enerf_ns.report import film
 from enerf_ns.report.film import Screen, render_moving, render_video
 from enerf_ns.report.pictures import camera_path

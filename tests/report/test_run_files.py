@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from enerf_ns.checkpoints import checkpoint_path
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.evaluation.history import HistoryRow, append_row
-from enerf_ns.evaluation.runs import Run
+from enerf_ns.method.checkpoints import checkpoint_path
+from enerf_ns.method.runs import Run
 from enerf_ns.report import run_files
 from enerf_ns.report.run_files import find_runs, read_run, run_names
 

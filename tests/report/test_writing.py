@@ -18,14 +18,14 @@ from browsers import BROWSER, told_by
 from PIL import Image
 from small_runs import SMALL
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.enerf_model import EnerfModel
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.evaluation.history import HistoryRow, append_row
 from enerf_ns.evaluation.metrics import EVENT_SCORES
 from enerf_ns.evaluation.protocols import described
-from enerf_ns.evaluation.runs import Run, method_config, train
 from enerf_ns.evaluation.scores import summary_scores
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.model import EnerfModel
+from enerf_ns.method.runs import Run, method_config, train
 from enerf_ns.report import writing
 from enerf_ns.report.figures import Curve, error_against
 from enerf_ns.report.pictures import camera_path

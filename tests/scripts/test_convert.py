@@ -18,11 +18,11 @@ from recordings import EVENTS, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis, wr
 from test_event_files import BAD, FORMATS, events
 from test_event_recording import CAMERA, all_events, copied, same_recording, write_recording
 
-from enerf_ns.dataparsers.errors import OutputError, RecordingError, UserError
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError, UserError
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.format_options import format_flags
 

@@ -14,10 +14,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from small_runs import SMALL
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.evaluation.runs import load, method_config, train
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.export import surface
+from enerf_ns.method.runs import load, method_config, train
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.export import Export
 from enerf_ns.scripts.format_options import format_flags

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from recordings import write_esim
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.scripts.format_options import format_flags
 from enerf_ns.scripts.inspect import Inspect
 

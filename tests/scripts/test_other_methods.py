@@ -103,7 +103,7 @@ def test_methods_train_on_sharp_frames_and_are_scored(
 
 
 def test_enerf_and_others_hold_out_the_same_frames(recording: Path, nerfacto: Path):
-    from enerf_ns.enerf_datamanager import EnerfDataManagerConfig
+    from enerf_ns.method.datamanager import EnerfDataManagerConfig
 
     own = EnerfDataManagerConfig(dataparser=EventDataParserConfig(data=recording)).setup(test_mode="inference")
     other: Any = eval_setup(nerfacto)[1]

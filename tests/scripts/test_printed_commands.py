@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from enerf_ns.dataparsers.errors import quoted
+from enerf_ns.dataparsers.recording.errors import quoted
 from enerf_ns.scripts.cli import entrypoint
 
 NAMES = (

@@ -35,7 +35,7 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from enerf_ns.dataparsers.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 

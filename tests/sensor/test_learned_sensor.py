@@ -14,12 +14,12 @@ import scipy.signal
 import torch
 from torch import Tensor
 
-from enerf_ns.dataparsers.event_index import EventIndex
-from enerf_ns.dataparsers.recording import Events
-from enerf_ns.dataparsers.sensor_estimates import threshold_differences
-from enerf_ns.enerf_config import SENSOR_LEARNING_RATES
+from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.recording.recording import Events
+from enerf_ns.dataparsers.sensor_estimates.estimates import threshold_differences
 from enerf_ns.events.batch import EventBatch
 from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
+from enerf_ns.method.config import SENSOR_LEARNING_RATES
 from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
 from enerf_ns.sensor.threshold_map import SOLVED_EVERY, ThresholdMap
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings

@@ -15,11 +15,11 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording, writer_of
 from enerf_ns.dataparsers.formats.writer import Rig
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer

@@ -18,8 +18,8 @@ from recordings import joined
 from scipy.optimize import brentq
 from scipy.stats import kstest
 
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.event_sensor import (
     CUT_JITTER,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.simulator.frames import Exposures, Frame, FrameSettings, develop
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from enerf_ns import paper_selections as training
+from enerf_ns.choices import presets as training
 from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
 from enerf_ns.simulator.scene.scenes import SCENES
 

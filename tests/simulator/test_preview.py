@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import OutputError
-from enerf_ns.dataparsers.recording import Events
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.simulator.preview import NO_COLOUR, OFF_COLOUR, ON_COLOUR, Preview
 
 WIDTH, HEIGHT = 64, 48

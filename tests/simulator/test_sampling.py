@@ -14,8 +14,8 @@ import torch
 from known_points import points_seen, project, reference_poses
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.sampling import MAX_CHANGE, MOST_HALVINGS, Render, adaptive_renders, render_times
 from enerf_ns.simulator.scene.render import Renderer

@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from enerf_ns.dataparsers.errors import FlagError
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
 from enerf_ns.simulator.settings import SimulationSettings, resolve

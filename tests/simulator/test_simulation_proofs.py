@@ -17,10 +17,10 @@ import torch
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.recording import Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings

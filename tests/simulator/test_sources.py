@@ -19,11 +19,11 @@ import torch
 from recordings import write_esim
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.trajectory import Trajectory
-from enerf_ns.evaluation.views import held_out_views
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES

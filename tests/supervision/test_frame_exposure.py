@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from enerf_ns.evaluation.runs import method_config, train
+from enerf_ns.method.runs import method_config, train
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.supervision.frame_exposure import FrameExposure

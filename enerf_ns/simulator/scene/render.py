@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from enerf_ns.compiled import compiled
-from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.compiled import compiled
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.simulator.scene.scenes import Scene
 
 GROUP = 4

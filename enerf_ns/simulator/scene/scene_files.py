@@ -58,9 +58,9 @@ from scipy.spatial.transform import Rotation
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 
-from enerf_ns.dataparsers.errors import RecordingError, UserError
-from enerf_ns.dataparsers.files import load_image, read_json
-from enerf_ns.dataparsers.picture_depth import find_white_level
+from enerf_ns.dataparsers.recording.errors import RecordingError, UserError
+from enerf_ns.dataparsers.recording.files import load_image, read_json
+from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.scenes import (
     LIGHT,

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.sources import RenderedScene
 

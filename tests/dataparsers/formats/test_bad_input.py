@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from recordings import HEIGHT, WIDTH, write_davis, write_esim, write_image
 
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_array, load_image
 
 
 @dataclass

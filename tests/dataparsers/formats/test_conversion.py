@@ -9,9 +9,9 @@ import pytest
 from recordings import EVENTS, joined, write_esim
 from test_event_files import FORMATS, events
 
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 
 
 def test_a_recording(tmp_path: Path):

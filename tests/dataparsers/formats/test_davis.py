@@ -10,12 +10,12 @@ import pytest
 import torch
 from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, joined, poses, write_davis
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats import davis
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 EPOCH = 1_468_939_802_123_456_789
 """An absolute time in ns; float64 seconds would round it to 0.2 microseconds."""

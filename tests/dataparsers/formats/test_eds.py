@@ -19,14 +19,14 @@ from known_points import points_seen, project, reference_poses, spot_centre, spo
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats import eds
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 SIZE = (640, 480)
 EPOCH = 1_635_184_867_123_456

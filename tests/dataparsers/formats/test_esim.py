@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from recordings import EVENTS, FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, image, poses, write_esim
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.files import load_image
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int64])

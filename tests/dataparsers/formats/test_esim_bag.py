@@ -24,10 +24,10 @@ from test_esim_npz import (
     write_views,
 )
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats import esim_bag, esim_npz
-from enerf_ns.dataparsers.indexing import index_events
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="rosbags is an optional extra of the project")
 typesys = pytest.importorskip("rosbags.typesys")

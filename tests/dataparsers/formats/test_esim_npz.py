@@ -18,12 +18,12 @@ from PIL import Image
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats import esim_npz
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording
 
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[150.0, 0.0, 80.5], [0.0, 152.0, 58.5], [0.0, 0.0, 1.0]])

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats import event_files
 from enerf_ns.dataparsers.formats.event_files import open_event_file
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 WIDTH, HEIGHT = 640, 480
 

@@ -27,13 +27,13 @@ from recordings import (
 )
 from scipy.spatial.transform import Rotation, Slerp
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 CAMERA = {"width": WIDTH, "height": HEIGHT, "model": "pinhole", "fx": 20.0, "fy": 21.0, "cx": 11.5, "cy": 8.5}
 MOUNTING = np.eye(4)

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 TRAJECTORY = Trajectory(np.array([0, 10**9]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))

@@ -34,13 +34,13 @@ from recordings import HEIGHT, WIDTH, joined, seconds, write_davis, write_esim
 from scipy.spatial.transform import Rotation
 from test_bad_input import contents, is_one_sentence
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_array, load_image
 from enerf_ns.dataparsers.formats.registry import _read_folder, read_recording
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.recording import EventRecording, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_array, load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 # ------------------------------------------------------------------------------------------------- what is damaged
 

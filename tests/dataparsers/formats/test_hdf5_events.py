@@ -9,9 +9,9 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats import hdf5_events
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 NUM_EVENTS = 5000
 EPOCH = 1_636_000_000_123_456

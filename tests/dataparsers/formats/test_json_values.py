@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.json_values import parse_array, parse_numbers, shown
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 FILE = Path("about.json")
 

@@ -10,9 +10,9 @@ import pytest
 from recordings import write_esim
 from test_writer import open_writer, random_events, setup_of, write
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.problems import find_problems
+from enerf_ns.dataparsers.inspection.problems import find_problems
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 FOLDERS = [
     *(("esim", name) for name in ("images", "images_corrupted", "depth")),

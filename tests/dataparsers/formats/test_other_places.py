@@ -16,8 +16,8 @@ from recordings import write_davis
 from test_bad_input import is_one_sentence, read_all
 from test_fuzz import LAYOUTS, write_eds, write_tum_vie
 
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_image
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_image
 
 NO_FILES: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,

@@ -13,8 +13,6 @@ from recordings import write_davis, write_esim
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers import event_dataparser
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import (
@@ -27,8 +25,10 @@ from enerf_ns.dataparsers.formats.registry import (
     writer_of,
 )
 from enerf_ns.dataparsers.formats.writer import Setup
-from enerf_ns.dataparsers.recording import EventRecording, Events
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.scripts.format_options import format_flags
 
 

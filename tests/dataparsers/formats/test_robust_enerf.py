@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.robust_enerf import checked_camera, checked_trajectory, listed, whole_nanoseconds
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 FILE = Path("poses.npz")
 MATRIX = np.array([[100.0, 0, 31.5], [0, 110, 23.5], [0, 0, 1]])

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from enerf_ns.dataparsers.errors import RecordingError
 from enerf_ns.dataparsers.formats.text_tables import parse_times, read_poses, read_rows, read_times
+from enerf_ns.dataparsers.recording.errors import RecordingError
 
 
 def table(folder: Path, text: str) -> Path:

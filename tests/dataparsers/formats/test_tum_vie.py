@@ -20,12 +20,12 @@ import torch
 from known_points import points_seen, project, reference_poses
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats import tum_vie
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 
 SIDES = ("left", "right")
 EXPOSURES = (4_000, 30_000, 12_000)

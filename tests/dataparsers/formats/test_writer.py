@@ -24,15 +24,15 @@ from known_points import reference_poses
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.files import load_image
 from enerf_ns.dataparsers.formats.registry import layouts, open_writer, read_recording
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
-from enerf_ns.dataparsers.indexing import index_events
-from enerf_ns.dataparsers.problems import find_problems
-from enerf_ns.dataparsers.recording import EventRecording, Events, Frames
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.inspection.problems import find_problems
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 LAYOUTS = layouts()
 END = 333_333_347

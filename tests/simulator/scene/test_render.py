@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray import ray_triangle
 
 import enerf_ns.dataparsers
-from enerf_ns.dataparsers.camera import Camera
 from enerf_ns.dataparsers.formats.eds import PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene
@@ -724,7 +724,7 @@ def test_pictures_from_several_threads_are_those_from_one():
 
 PICTURE = """
 import hashlib, numpy as np
-from enerf_ns.dataparsers.camera import Camera
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
 renderer = Renderer(SCENES["carpet"](np.random.default_rng(0)), Camera(64, 48, 55.0, 55.0, 31.5, 23.5))

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scene_files import load_scene

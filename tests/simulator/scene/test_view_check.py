@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from numpy.typing import ArrayLike
 
-from enerf_ns.dataparsers.camera import Camera
-from enerf_ns.dataparsers.errors import RecordingError
-from enerf_ns.dataparsers.trajectory import Trajectory
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene

@@ -1,0 +1,173 @@
+"""Indices of events on disk, so that a large recording is sorted once.
+
+An entry is a folder named after a hash of what the index was made from. It is written beside its place and then
+renamed, so that it is whole or not there, however many processes build it at once and wherever they are stopped.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import zlib
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+from platformdirs import user_cache_path
+
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
+from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_survey import EventStream, Survey, sorted_bands
+from enerf_ns.dataparsers.recording.files import expanded, partial_of
+
+LAYOUT = 3
+"""Version of what is stored in an entry, counted up when that changes."""
+
+CACHED_FROM = 2_000_000
+"""Number of events from which an index is stored; fewer are sorted again each time, which takes less than a second."""
+
+COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
+
+BLOCK = 2**22
+"""Bytes that are read at once for a checksum."""
+
+
+def cache_folder() -> Path:
+    """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder.
+
+    Raises:
+        OSError: The user has no home folder.
+        OutputError: $ENERF_CACHE lies within a recording.
+    """
+    if "ENERF_CACHE" in os.environ:
+        folder = expanded(os.environ["ENERF_CACHE"])
+        check_outside_recordings("ENERF_CACHE", folder)
+        return folder
+    unknown = FileNotFoundError(errno.ENOENT, "no home folder is known", "~")
+    try:
+        folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
+    except RuntimeError as error:  # of platformdirs from 4.9 on; before, the folder is one named ~
+        raise unknown from error
+    if not folder.is_absolute():
+        raise unknown
+    return folder
+
+
+def entry_name(**made_from: object) -> str:
+    """Name of the entry for an index that is determined by these values (JSON types)."""
+    text = json.dumps({"layout": LAYOUT, **made_from}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def load_index(name: str) -> tuple[EventIndex, Survey] | None:
+    """An index from the cache, mapped into memory; None where there is none. A damaged one is removed."""
+    try:
+        folder = cache_folder() / name
+    except OSError:
+        return None
+    try:
+        stored = json.loads((folder / "index.json").read_text())
+        for column in COLUMNS:
+            if _checksum(folder / column) != stored["checksums"][column]:
+                raise ValueError(f"{column} is damaged")
+        times, positives, counts = (np.memmap(folder / column, kind, "c") for column, kind in COLUMNS.items())
+        survey = Survey(counts=np.array(counts), **stored["survey"])
+        if len(times) != len(positives) or len(times) != survey.counts.sum():
+            raise ValueError("the columns do not fit together")
+        survey.hot_pixels = np.array(survey.hot_pixels, np.int64)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError):
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+    return _index(times, positives, survey), survey
+
+
+def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]) -> EventIndex:
+    """Sorts the events, and stores the index in the cache where that pays.
+
+    Of more events than a quarter of the memory holds, a band of pixels after the other is sorted and written.
+
+    Args:
+        stream: The events that were surveyed.
+        survey: Without faults.
+        name: Of the entry.
+        notes: Gets a sentence where the index could not be stored.
+
+    Raises:
+        OSError: The events do not fit into memory, and cannot be stored either.
+        ValueError: The events are not those that were surveyed.
+    """
+    num_events, in_memory = int(survey.counts.sum()), psutil.virtual_memory().total // 4 // 12
+    bands = sorted_bands(stream, survey, in_memory)
+    if num_events < CACHED_FROM:
+        return _index(*next(bands), survey)
+    if num_events > in_memory:
+        _store(name, survey, bands)
+    else:
+        times, positives = next(bands)
+        try:
+            _store(name, survey, iter([(times, positives)]))
+        except OSError as error:
+            notes.append(
+                f"The index of {num_events:,} events could not be stored in the cache "
+                f"({error.strerror or error}), so that the next start takes as long; make room, or set ENERF_CACHE to "
+                "another folder."
+            )
+            return _index(times, positives, survey)
+        del times, positives
+    loaded = load_index(name)
+    if loaded is None:
+        raise OSError(f"the index could not be read back from {cache_folder() / name}")
+    return loaded[0]
+
+
+def _store(name: str, survey: Survey, bands) -> None:
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    partial = partial_of(cache_folder() / name)
+    partial.mkdir()
+    try:
+        with open(partial / "times", "wb") as times_file, open(partial / "positives", "wb") as positives_file:
+            for times, positives in bands:
+                times_file.write(times.data)
+                positives_file.write(positives.data)
+        survey.counts.tofile(partial / "counts")
+        facts = {key: value for key, value in asdict(survey).items() if key != "counts"}
+        facts["hot_pixels"] = survey.hot_pixels.tolist()
+        checksums = {}
+        for column in COLUMNS:
+            with open(partial / column, "rb+") as file:
+                os.fsync(file.fileno())
+            checksums[column] = _checksum(partial / column)
+        (partial / "index.json").write_text(json.dumps({"survey": facts, "checksums": checksums}))
+        try:
+            partial.rename(cache_folder() / name)
+        except OSError:
+            if load_index(name) is None:  # else another process was faster
+                raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _index(times: np.ndarray, positives: np.ndarray, survey: Survey) -> EventIndex:
+    return EventIndex(
+        torch.from_numpy(times),
+        torch.from_numpy(positives),
+        survey.offsets,
+        survey.width,
+        torch.from_numpy(survey.hot_pixels),
+    )
+
+
+def _checksum(path: Path) -> list[int]:
+    """Size of a file, and the checksum of all of it."""
+    checksum = 0
+    with open(path, "rb") as file:
+        while block := file.read(BLOCK):
+            checksum = zlib.crc32(block, checksum)
+    return [path.stat().st_size, checksum]

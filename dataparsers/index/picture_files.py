@@ -1,0 +1,63 @@
+"""Frames as files that any program can open, undistorted; kept in the cache, so that each is made once."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+from rich.progress import track
+
+from enerf_ns.dataparsers.index.index_cache import cache_folder
+from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
+from enerf_ns.dataparsers.recording.recording import Frames
+
+LAYOUT = 2
+"""Version of what is written, counted up when that changes."""
+
+
+def write_pictures(frames: Frames) -> list[Path]:
+    """Files of the pictures of frames, PNG of 8 bits in grey or colour, in a folder of the cache.
+
+    The folder is named after a hash of the recording's folder and the cameras; a file has the name of its frame, and
+    its time of modification, by which it is known to be up to date.
+
+    Raises:
+        RecordingError: A frame is missing or cannot be decoded.
+        OutputError: A file cannot be written.
+    """
+    try:
+        places = [_place(frames, source) for source in frames.filenames]
+    except OSError as error:
+        raise OutputError(
+            f"The undistorted pictures cannot be written ({error.strerror}); set ENERF_CACHE to a folder for them."
+        ) from error
+    missing = [i for i, place in enumerate(places) if not _is_current(place, frames.filenames[i])]
+    for i in track(missing, "Writing undistorted pictures", transient=True, disable=not missing):
+        picture, state = in_8_bits(frames.picture(i)), frames.filenames[i].stat()
+        encoded = cv2.imencode(".png", picture[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+        try:
+            write_whole(places[i], encoded)
+            os.utime(places[i], ns=(state.st_mtime_ns, state.st_mtime_ns))
+        except OSError as error:
+            raise OutputError(
+                f"The undistorted pictures cannot be written to {places[i].parent} ({error.strerror or error}); make "
+                "room, or set ENERF_CACHE to another folder."
+            ) from error
+    return places
+
+
+def _place(frames: Frames, source: Path) -> Path:
+    camera, directions = frames.camera, frames.camera.directions
+    lens = [getattr(camera, field.name) for field in fields(camera) if field.name != "directions"]
+    made_from = repr((LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor, frames.white_level)).encode()
+    table = b"" if directions is None else directions.tobytes()
+    return cache_folder() / f"pictures-{hashlib.sha256(made_from + table).hexdigest()[:32]}" / f"{source.stem}.png"
+
+
+def _is_current(place: Path, source: Path) -> bool:
+    return place.exists() and source.exists() and place.stat().st_mtime_ns == source.stat().st_mtime_ns

@@ -1,0 +1,333 @@
+"""How sharp the events are once the camera's motion is taken out of them, whatever the poses may have meant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
+from enerf_ns.dataparsers.scene.depth_range import (
+    TILE,
+    grid_focal_length,
+    grid_scale,
+    rays_in_view,
+    sweep_planes,
+)
+
+LARGEST_DELAY = 50_000_000
+"""Longest delay of a clock that is looked for, ns; a quarter of a shorter recording at most."""
+
+PATH_OF_WINDOW = 0.09
+"""How far the picture moves within the window of time whose events are warped together, as a share of its width."""
+
+LONGEST_WINDOW = 1_000_000_000
+"""Longest window, ns, of a camera that hardly moves."""
+
+NUM_WINDOWS = 8
+"""Most windows: half of them spread evenly over the recording, half where the motion changes most."""
+
+EVENTS_PER_WINDOW = 25_000
+"""Most events of a window by which hypotheses are compared, evenly taken."""
+
+EVENTS_PER_PICTURE = 60_000
+"""Most events that are drawn into a picture, evenly taken."""
+
+FEWEST_EVENTS = 2_000
+"""Fewest events of a window that say anything."""
+
+FEWEST_TILES = 12
+"""Smallest sensor, in tiles."""
+
+PLANES = np.arange(0.0, 65.0)
+"""Planes of the sweep: grid pixels by which a point moves when the camera goes as far as it does in the window."""
+
+NEAREST_PLANE = 2.0
+"""Nearest plane, in multiples of how far the camera goes in the window from where it is in its middle."""
+
+STEPS_OF_WINDOW = 512
+"""Instants of a window at which its poses are taken."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A way in which the poses of a file may be meant, other than that in which they were read."""
+
+    words: str
+    """What the poses are, if this reading is right; follows "read as"."""
+    of: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
+    """Turns the trajectory as it was read into that which was meant."""
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Signs of the camera's axes; an odd number of negative ones mirrors the picture, or puts the scene behind."""
+
+
+def _inverse(trajectory: Trajectory) -> Trajectory:
+    turned = Rotation.from_quat(trajectory.quaternions).inv()
+    return Trajectory(trajectory.times, -turned.apply(trajectory.positions), turned.as_quat())
+
+
+def _reordered(order: tuple[int, int, int, int]) -> Callable[[Trajectory], Trajectory]:
+    return lambda read: Trajectory(read.times, read.positions, read.quaternions[:, order])
+
+
+def _axes(signs: tuple[float, float, float]) -> str:
+    names = ("right", "left"), ("down", "up"), ("forward", "backward")
+    x, y, z = (names[axis][sign < 0] for axis, sign in enumerate(signs))
+    return f"axes with x {x}, y {y}, z {z}"
+
+
+AS_READ = Reading("what they were read as")
+OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1))
+INVERSE = Reading("world to camera, the inverse", _inverse)
+SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)))
+SCALAR_LAST = Reading("quaternions in the order x y z w", _reordered((3, 0, 1, 2)))
+READINGS = (
+    INVERSE,
+    SCALAR_FIRST,
+    SCALAR_LAST,
+    OPENGL,
+    *(
+        Reading(("mirrored " if np.prod(signs) < 0 else "") + _axes(signs), signs=signs)
+        for signs in ((-1, 1, 1), (1, -1, 1), (-1, -1, 1), (-1, 1, -1), (1, 1, -1), (-1, -1, -1))
+    ),
+)
+"""Other readings, the likeliest mistakes first."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may be the case with poses and calibration."""
+
+    delay: int = 0
+    """How much later (ns) the poses are stamped than events of the same instant."""
+    focal_scale: float = 1.0
+    """The focal length as a multiple of the stated one."""
+    reading: Reading = AS_READ
+
+    @property
+    def words(self) -> str:
+        """What it says about the poses' clock and the focal length; that they are as stated if it says nothing."""
+        said = [f"poses {self.delay * 1e-6:+.3g} ms"] * (self.delay != 0)
+        said += [f"focal length {100 * (self.focal_scale - 1):+.0f} %"] * (self.focal_scale != 1)
+        return ", ".join(said) or "as stated"
+
+
+AS_STATED = Hypothesis()
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Events that are warped to one instant."""
+
+    start: int
+    """First and last time, ns."""
+    end: int
+    speed: float
+    """Pixels a second that the picture moves."""
+    events: Events
+
+    @property
+    def instant(self) -> int:
+        """The time, ns, that events are warped to."""
+        return (self.start + self.end) // 2
+
+
+class EventFocus:
+    """Events of a recording, warped to one instant of each of some windows.
+
+    Each event of a window is moved to where the camera saw its edge at the instant in the middle, by the poses and a
+    depth. The depth is that at which the events of a tile (16 grid pixels a side) are sharpest, found by a sweep of
+    planes as in `depth_range`, for each hypothesis anew, so that it has the depths that serve it best. Sharpness is the
+    variance of the image of warped events (Gallego et al., "A Unifying Contrast Maximization Framework", CVPR 2018),
+    summed over the pixels and divided by the number of events. Every hypothesis is measured with the same events; those
+    that leave the view, or go behind the camera, add nothing; and magnification does not count as sharpness.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        distance: Usual depth of the scene, metres; by it windows are chosen that are long enough.
+    """
+
+    def __init__(self, recording: EventRecording, distance: float):
+        self.recording = recording
+        start, end = index_events(recording).span
+        start, end = max(start, recording.trajectory.start), min(end, recording.trajectory.end)
+        self.largest_delay = min(LARGEST_DELAY, (end - start) // 4)
+        """Longest delay, ns, for which there are poses around each event of the windows."""
+        self.windows = []
+        """In time order; none where there are too few events, or pixels, to say anything."""
+        if (
+            recording.camera.width * recording.camera.height * grid_scale(recording.camera) ** 2
+            >= FEWEST_TILES * TILE**2
+        ):
+            self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
+        self._trajectories = {AS_READ: recording.trajectory}
+        self._cameras = {1.0: recording.camera}
+
+    @property
+    def speed(self) -> float:
+        """Pixels a second that the picture moves in the fastest windows (90th percentile)."""
+        return float(np.percentile([window.speed for window in self.windows], 90))
+
+    @cached_property
+    def turn(self) -> float:
+        """Radians by which the line of sight turns away from where it is in the middle of a window, the most of all."""
+        turns = []
+        for window in self.windows:
+            times = np.append(evenly_spaced(window.start, window.end, 17), window.instant)
+            sights = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()[:, :, 2]
+            turns.append(np.linalg.norm(np.cross(sights[:-1], sights[-1]), axis=1).max())
+        return float(max(turns))
+
+    def sharpness(self, hypothesis: Hypothesis = AS_STATED) -> Float64[np.ndarray, "windows*tiles"]:
+        """Sharpness of each tile at its best depth, as a share of the sum over the tiles of a window."""
+        return np.concatenate(
+            [
+                self._sweep(window, _some(window.events, EVENTS_PER_WINDOW), hypothesis)[0].max(0)
+                for window in self.windows
+            ]
+        )
+
+    def picture(
+        self, window: Window, hypothesis: Hypothesis | None = AS_STATED
+    ) -> tuple[Float64[np.ndarray, "rows columns"], float]:
+        """Events of a window, each tile at its best depth: how many a grid pixel holds, and the sharpness.
+
+        Args:
+            window: One of `windows`.
+            hypothesis: None: events are drawn where they fired.
+        """
+        events = _some(window.events, EVENTS_PER_PICTURE)
+        camera = self._camera(1.0 if hypothesis is None else hypothesis.focal_scale)
+        scale, focal = grid_scale(camera), grid_focal_length(camera)
+        columns, rows = (round(side * scale) // TILE * TILE for side in (camera.width, camera.height))
+        if hypothesis is None:
+            rays, planes = camera.pixel_directions()[events.y, events.x], np.zeros(1)
+            centres, best = np.zeros_like(rays), np.zeros((rows, columns), int)
+        else:
+            variance, rays, centres, planes = self._sweep(window, events, hypothesis)
+            best = variance.argmax(0).reshape(rows // TILE, columns // TILE).repeat(TILE, 0).repeat(TILE, 1)
+        start = focal * rays[:, :2] + np.array([camera.cx, camera.cy]) * scale
+        picture = np.zeros((rows, columns))
+        for i in np.unique(best):
+            x, y = np.rint(start + planes[i] * (centres[:, :2] - centres[:, 2:] * rays[:, :2])).astype(int).T
+            seen = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+            areas = (1 - planes[i] / focal * centres[seen, 2]) ** 2
+            drawn = np.bincount(y[seen] * columns + x[seen], areas, rows * columns).reshape(rows, columns)
+            picture = np.where(best == i, drawn, picture)
+        tiles = picture.reshape(rows // TILE, TILE, columns // TILE, TILE)
+        return picture, float(tiles.var((1, 3)).sum() * TILE**2 / len(events))
+
+    def _sweep(
+        self, window: Window, events: Events, hypothesis: Hypothesis
+    ) -> tuple[
+        Float64[np.ndarray, "planes tiles"],
+        Float64[np.ndarray, "rays 3"],
+        Float64[np.ndarray, "rays 3"],
+        Float64[np.ndarray, " planes"],
+    ]:
+        """Sharpness of each tile at each plane; and rays, their centres as shares of the way, and planes."""
+        read = self._trajectory(hypothesis.reading)
+        times = evenly_spaced(window.start, window.end, STEPS_OF_WINDOW)
+        moments = np.append(times, window.instant) + hypothesis.delay
+        poses = read.poses(torch.from_numpy(moments.clip(read.start, read.end))).numpy()
+        poses[:, :, :3] *= hypothesis.reading.signs
+        reach = float(np.linalg.norm(poses[:, :, 3] - poses[-1, :, 3], axis=1).max())
+
+        moment = np.rint((events.t - window.start) * ((len(times) - 1) / (window.end - window.start))).astype(int)
+        camera = self._camera(hypothesis.focal_scale)
+        rays, centres = rays_in_view(camera.pixel_directions()[events.y, events.x], poses[moment], poses[-1])
+        planes = PLANES[grid_focal_length(camera) > NEAREST_PLANE * PLANES] if reach else PLANES[:1]
+        centres = centres / (reach or 1.0)
+        dispersion, votes = sweep_planes(rays, centres, camera, planes)
+        return dispersion * votes * TILE**2 / len(events), rays, centres, planes
+
+    def _trajectory(self, reading: Reading) -> Trajectory:
+        if reading not in self._trajectories:
+            read = self.recording.trajectory
+            body, mount = read.body or (read, None)
+            meant = reading.of(body)
+            self._trajectories[reading] = meant if mount is None else meant.of_mounted(mount)
+        return self._trajectories[reading]
+
+    def allows(self, focal_scale: float) -> bool:
+        """Whether the lens has an inverse with such a multiple of its focal length."""
+        try:
+            self._camera(focal_scale).pixel_directions()
+        except ValueError:
+            return False
+        return True
+
+    def _camera(self, scale: float) -> Camera:
+        if scale not in self._cameras:
+            stated = self.recording.camera
+            directions = None if stated.directions is None else stated.directions / scale
+            self._cameras[scale] = replace(stated, fx=stated.fx * scale, fy=stated.fy * scale, directions=directions)
+        return self._cameras[scale]
+
+
+def _some(events: Events, at_most: int) -> Events:
+    """About so many events, evenly taken."""
+    step = max(round(len(events) / at_most), 1)
+    return Events(events.x[::step], events.y[::step], events.t[::step], events.p[::step])
+
+
+def _windows(recording: EventRecording, start: int, end: int, distance: float) -> list[Window]:
+    """Windows within a span of time (ns), in order, outside the gaps of the poses."""
+    spans, speeds, changes = _spans_of_motion(recording, start, end, distance)
+    if not len(spans):
+        return []
+    evenly = np.unique(np.linspace(0, len(spans) - 1, NUM_WINDOWS // 2).round().astype(int))
+    others = np.setdiff1d(np.argsort(-changes), evenly, assume_unique=True)
+    chosen = np.sort(np.append(evenly, others[: NUM_WINDOWS - len(evenly)]))
+    events = index_events(recording).events_within(spans[chosen])
+    windows = []
+    for i in chosen:
+        first, last = np.searchsorted(events.t, spans[i] + [0, 1])
+        own = Events(events.x[first:last], events.y[first:last], events.t[first:last], events.p[first:last])
+        if len(own) >= FEWEST_EVENTS:
+            windows.append(Window(int(spans[i, 0]), int(spans[i, 1]), float(speeds[i]), own))
+    return windows
+
+
+def _spans_of_motion(
+    recording: EventRecording, start: int, end: int, distance: float
+) -> tuple[Int64[np.ndarray, "spans 2"], Float64[np.ndarray, " spans"], Float64[np.ndarray, " spans"]]:
+    """Spans of time (ns), one after the other, in which the picture moves by PATH_OF_WINDOW; its speed (pixels/s) in
+    each, and by how much the velocity differs from its mean."""
+    none = np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0)
+    if end - start < 2:
+        return none
+    number = int(np.clip((end - start) // 1_000_000, 200, 200_000))
+    times = evenly_spaced(start, end, number + 1)
+    poses = recording.trajectory.poses(torch.from_numpy(times)).numpy()
+    turned = poses[:-1, :, :3].transpose(0, 2, 1) @ poses[1:, :, :3]
+    moved = np.einsum("nji,nj->ni", poses[:-1, :, :3], np.diff(poses[:, :, 3], axis=0))
+    steps = recording.camera.fx * np.append(Rotation.from_matrix(turned).as_rotvec(), moved / distance, axis=1)
+    path = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=1)))
+    spans, speeds, changes = [], [], []
+    begin = 0
+    while begin < number:
+        far = np.searchsorted(path, path[begin] + PATH_OF_WINDOW * recording.camera.width)
+        late = np.searchsorted(times, times[begin] + LONGEST_WINDOW)
+        after = min(far, late)
+        if after > number:  # the rest is a part of a window: that which ends with the recording
+            after = number
+            begin = int(max(np.searchsorted(path, path[-1] - PATH_OF_WINDOW * recording.camera.width, "right") - 1,
+                            np.searchsorted(times, times[-1] - LONGEST_WINDOW), 0))  # fmt: skip
+        span = times[[begin, after]]
+        if not recording.trajectory.in_gaps(span[:1], span[1:]).any() or recording.keep_pose_gaps:
+            seconds = np.diff(times[begin : after + 1]) * 1e-9
+            velocity = steps[begin:after] / seconds[:, None]
+            spans.append(span)
+            speeds.append((path[after] - path[begin]) / seconds.sum())
+            changes.append(np.linalg.norm(velocity - velocity.mean(0), axis=1).mean())
+        begin = max(after, begin + 1)
+    return (np.stack(spans), np.array(speeds), np.array(changes)) if spans else none

@@ -1,0 +1,502 @@
+"""What a recording holds in numbers, and what is wrong with it; knows nothing of learning."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import read_json
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, nanoseconds, percent
+from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
+from enerf_ns.dataparsers.scene.depth_range import recording_parallax
+
+MAX_BINS = 1000
+"""Most bins of the event rate: more are not told apart on a screen."""
+
+EVENTS_PER_BIN = 200
+"""Fewest events in a bin of the event rate on average; so many random events never leave a bin empty."""
+
+SAMPLED_EVENTS = 2**22
+"""Events looked at to find problems, evenly taken, so that a training of a large recording does not wait."""
+
+EVENTS_AT_ONCE = 2**24
+"""Events whose times are held in memory while they are counted."""
+
+MAX_SHARE_OUTSIDE = 0.05
+"""Largest share of events or frames without poses; a camera that starts a moment before the tracker loses less."""
+
+MAX_TURN = 5.0
+"""Most degrees that the camera may turn between two poses. A hand's angular acceleration of 1000 degrees/s² at 20 poses
+a second turns the camera by 2.5 degrees between poses, of which interpolation gets 0.3 wrong: a few pixels."""
+
+JUMP_RATIO = 5
+"""Factor by which a jump between two poses is faster than its neighbourhood's median; the noise of a tracker stays
+below 3."""
+
+JUMP_NEIGHBOURHOOD = 11
+"""Steps between poses whose median speed a jump is compared to: more than twice the two steps of one wrong pose."""
+
+MIN_JUMP = 5.0
+"""Least pixels by which the picture moves too far in a jump between two poses; smaller jumps are blurred, but do not
+double edges."""
+
+MOVING = 0.3
+"""Share of the picture's speed at a fast moment (90th percentile) above which the camera is said to move."""
+
+DROPOUT_RATIO = 0.02
+"""Share of the usual event rate below which the sensor is silent; noise alone makes some per cent in dim light."""
+
+MIN_SILENT_MOTION = 5.0
+"""Least pixels that the picture moves during a silence. Where the camera turns back, edges pass twice before pixels
+fire."""
+
+BURST_RATIO = 20
+"""Factor by which a burst exceeds the usual event rate, beyond what the speed of the camera explains."""
+
+MAX_POLARITY_RATIO = 3.0
+"""Largest ratio between on and off events. Sensors are set up for equal thresholds; those delivered stay below 2."""
+
+MAX_SHARE_BELOW_TWO = 0.5
+"""Largest share of pixels with fewer than two events, which make no pair to learn from."""
+
+MIN_EVENTS_PER_PIXEL = 10
+"""Fewest events of a pixel on average: a few grey levels' worth of change; recordings that the method was shown on have
+dozens."""
+
+MIN_SHARE_AT_CUT = 0.2
+"""Events in the last two columns (or rows) up to 255, as a share of the median column, from which it is a cut and not
+the border of the scene that they end at."""
+
+FLOAT_TIMES, FEWEST_FLOAT_TIMES = 2**16, 100
+"""Times of events that are compared with numbers of single precision, and how many of them must be different ones."""
+
+MAX_SHARE_HOT = 0.001
+"""Largest share of pixels that are hot; a healthy sensor has a handful."""
+
+MIN_FRAMES = 8
+"""Fewest frames, of which, with every fourth held out, six are left to learn from and two to score."""
+
+MAX_SHARE_DROPPED_FRAMES = 0.05
+"""Largest share of frames missing in a regular sequence; more of them point at wrong stamps."""
+
+MIN_PARALLAX = 5.0
+"""Least pixels of the events' camera by which the nearest point moves against the farthest: less is lost in blur."""
+
+ASSUMED_NEAREST = 0.5
+"""Nearest depth that is assumed, metres, where the recording does not state how near the scene is."""
+
+MAX_EXTENT = 100.0
+"""Most metres that the path of a camera spans; a hand-held path in millimetres spans hundreds."""
+
+MAX_DEPTH_RATIO = 100.0
+"""Largest ratio between farthest and nearest depth; samples along rays are spread over all of it."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something about a recording that makes learning from it worse, or impossible."""
+
+    what: str
+    """What was found, with numbers; one sentence."""
+    advice: str
+    """What to do about it; one sentence."""
+
+
+@dataclass(frozen=True)
+class EventStatistics:
+    """The events of a recording in numbers; hot pixels that are left out are not counted."""
+
+    edges: Int64[np.ndarray, " bins+1"]
+    """Edges of the bins of time, ns; from the first event to the last."""
+    rate: Float64[np.ndarray, " bins"]
+    """Events per second in each bin of time."""
+    counts: Int64[np.ndarray, "height width"]
+    """Events of each pixel."""
+    num_on: int
+    num_off: int
+    num_hot_pixels: int
+
+    @property
+    def num_events(self) -> int:
+        return self.num_on + self.num_off
+
+    @property
+    def seconds(self) -> float:
+        """Seconds from the first event to the last, at least a nanosecond."""
+        return max(int(self.edges[-1] - self.edges[0]), 1) * 1e-9
+
+    @property
+    def share_below_two(self) -> float:
+        """Share of all pixels that have fewer than two events."""
+        return float((self.counts < 2).mean())
+
+    @property
+    def events_per_pixel(self) -> float:
+        return self.num_events / self.counts.size
+
+
+def event_statistics(recording: EventRecording, at_most: int | None = None) -> EventStatistics:
+    """Counts the events of a recording.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        at_most: Events whose times are looked at for the rate, evenly taken; None: all. The other numbers are exact.
+
+    Raises:
+        RecordingError: The events cannot be used.
+    """
+    index, camera = index_events(recording), recording.camera
+    step = 1 if at_most is None else -(-len(index) // at_most)
+    num_bins = int(np.clip(len(index) // step // EVENTS_PER_BIN, 1, MAX_BINS))
+    start, end = index.span
+    edges, counted = evenly_spaced(start, end, num_bins + 1), np.zeros(num_bins, np.int64)
+    inner = torch.from_numpy(edges[1:-1])
+    for first in range(0, len(index), step * EVENTS_AT_ONCE):
+        times = index.times[first : first + step * EVENTS_AT_ONCE : step].contiguous()
+        counted += torch.bucketize(times, inner, right=True).bincount(minlength=num_bins).numpy()
+    return EventStatistics(
+        edges=edges,
+        rate=counted * step / np.maximum(np.diff(edges) * 1e-9, 1e-9),
+        counts=index.offsets.diff().numpy().reshape(camera.height, camera.width),
+        num_on=index.num_positive,
+        num_off=len(index) - index.num_positive,
+        num_hot_pixels=len(index.hot_pixels),
+    )
+
+
+def find_problems(recording: EventRecording, depth_range: tuple[float, float] | None = None) -> list[Problem]:
+    """What is wrong with a recording, and what to do about it; in seconds, once the events are indexed.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        depth_range: Nearest and farthest depth in metres, if known better than from the recording.
+
+    Raises:
+        RecordingError: The events cannot be used.
+    """
+    statistics = event_statistics(recording, SAMPLED_EVENTS)
+    depth_range = depth_range or recording.depth_range
+    gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
+    silences, bursts = unusual_rates(recording, statistics, depth_range)
+    flag = _time_range_without(np.concatenate([gaps, jumps, silences, bursts]), statistics)
+    return [
+        *_unfinished(recording.path),
+        *_left_out({**recording.shares_outside_poses, "events": index_events(recording).share_outside_poses}),
+        *_pose_problems(recording, statistics, gaps, jumps, flag),
+        *_distance_problems(recording, statistics, depth_range),
+        *_rate_problems(silences, bursts, flag),
+        *_count_problems(statistics),
+        *_cut_coordinates(statistics),
+        *_coarse_times(recording),
+        *_frame_problems(recording.frames or recording.blurred_frames),
+    ]
+
+
+def pose_gaps(recording: EventRecording, statistics: EventStatistics) -> Int64[np.ndarray, "gaps 2"]:
+    """Begin and end (ns) of each gap of the poses that reaches into the span of the events."""
+    (first, *_, last), gaps = statistics.edges, recording.pose_gaps
+    return gaps[(gaps[:, 0] < last) & (gaps[:, 1] > first)]
+
+
+def pose_jumps(
+    recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
+) -> Int64[np.ndarray, "jumps 2"]:
+    """Times (ns) of the poses before and after each jump, the largest jump first.
+
+    Args:
+        recording: Of which the camera's steps from pose to pose are taken.
+        statistics: Of its events.
+        depth_range: Nearest and farthest depth in metres, where it is known.
+    """
+    times, turns, moves = _pose_steps(recording, statistics)
+    intervals = np.diff(times)
+    shift = recording.camera.fx * (turns + moves / _viewing_distance(recording, statistics, depth_range))
+    usual = median_filter(shift / intervals, JUMP_NEIGHBOURHOOD, mode="nearest") * intervals
+    jumps = np.flatnonzero((shift > JUMP_RATIO * usual) & (shift > usual + MIN_JUMP))
+    jumps = jumps[np.argsort(usual[jumps] - shift[jumps])]
+    return np.stack([times[jumps], times[jumps + 1]], axis=1)
+
+
+def unusual_rates(
+    recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
+) -> tuple[Int64[np.ndarray, "silences 2"], Int64[np.ndarray, "bursts 2"]]:
+    """Begin and end (ns) of each time that the sensor is silent while it moves, and of each burst of events.
+
+    Args:
+        recording: Of which the camera's speed is taken.
+        statistics: Of its events.
+        depth_range: Nearest and farthest depth in metres, where it is known.
+    """
+    edges, rate = statistics.edges, statistics.rate
+    poses = recording.trajectory.poses(torch.from_numpy(edges)).numpy()
+    distance = _viewing_distance(recording, statistics, depth_range)
+    turns, moves = _steps(Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3])
+    known = ~recording.trajectory.in_gaps(edges)
+    shift = np.where(known[:-1] & known[1:], recording.camera.fx * (turns + moves / distance), 0.0)
+    speed = shift / np.maximum(np.diff(edges), 1)
+    moving = speed > MOVING * np.percentile(speed, 90)
+    usual_rate, usual_speed = (np.median(column[moving]) if moving.any() else 0.0 for column in (rate, speed))
+    silences = _spans(moving & (rate < DROPOUT_RATIO * usual_rate), edges)
+    shifted = np.append(0.0, np.cumsum(shift))[np.searchsorted(edges, silences)]
+    burst = (rate > BURST_RATIO * usual_rate) & (rate * usual_speed > BURST_RATIO * usual_rate * speed)
+    return silences[shifted[:, 1] - shifted[:, 0] > MIN_SILENT_MOTION], _spans(burst & (usual_rate > 0), edges)
+
+
+def _unfinished(folder: Path) -> Iterator[Problem]:
+    settings = folder / "simulation.json"
+    try:
+        stopped = settings.is_file() and read_json(settings).get("finished") is False
+    except RecordingError as error:
+        yield Problem(str(error), "Without it nobody knows whether the simulation was stopped before its end.")
+        return
+    if stopped:
+        yield Problem(
+            "The simulation of this recording was stopped before its end.",
+            "Simulate it again into a new folder, or use what there is.",
+        )
+
+
+def _left_out(shares_outside_poses: dict[str, float]) -> Iterator[Problem]:
+    for what, share in shares_outside_poses.items():
+        if share > MAX_SHARE_OUTSIDE:
+            yield Problem(
+                f"{percent(share)} of the {what} lie outside the poses and are left out.",
+                "Check that poses and events are on one clock, and add the poses that are missing; where the tracker "
+                "only saw a part, nothing else need be done.",
+            )
+
+
+def _pose_problems(
+    recording: EventRecording, statistics: EventStatistics, gaps: np.ndarray, jumps: np.ndarray, flag: str
+) -> Iterator[Problem]:
+    times, turns, moves = _pose_steps(recording, statistics)
+    usual_interval = f"{np.median(np.diff(times)) * 1e-6:.3g} ms"
+    if len(gaps):
+        begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
+        yield Problem(
+            f"There are no poses for {(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on"
+            + (f", and in {_count(len(gaps) - 1, 'other gap')}" if len(gaps) > 1 else "")
+            + f", while they usually come every {usual_interval}; what lies there is "
+            + ("used with guessed poses." if recording.keep_pose_gaps else "left out."),
+            f"Add the poses that are missing, or use a part that the tracker saw: {flag}.",
+        )
+    inside = ~np.isin(times[:-1], gaps[:, 0])
+    if inside.any() and (turn := math.degrees(np.percentile(turns[inside], 99))) > MAX_TURN:
+        yield Problem(
+            f"The camera turns by up to {turn:.0f} degrees from one pose to the next; those between are guesses.",
+            f"Record poses more often than every {usual_interval}, or use a slower part with --time-range.",
+        )
+    if len(jumps):
+        largest = np.searchsorted(times, jumps[0, 0])
+        yield Problem(
+            f"The poses hold {_count(len(jumps), 'jump')}; the largest is by {moves[largest]:.3g} m and "
+            f"{math.degrees(turns[largest]):.2g} degrees at {jumps[0, 0] * 1e-9:.2f} s.",
+            f"Remove the wrong poses from their file, and they are interpolated; or use a part without: {flag}.",
+        )
+
+
+def _distance_problems(
+    recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
+) -> Iterator[Problem]:
+    extent = _extent(recording, statistics)
+    nearest = depth_range[0] if depth_range else ASSUMED_NEAREST
+    shift = recording.camera.fx * extent / nearest
+    found = None
+    if shift < MIN_PARALLAX:
+        found = f"its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by {shift:.1f} pixels"
+    elif (parallax := recording_parallax(recording)).is_ruled_out:
+        found = (
+            f"its rotation alone explains {parallax.num_at_infinity:,} parts of the views; depths explain "
+            f"{len(parallax.depths):,}, and depths behind the camera, which is chance, {parallax.num_by_chance:,}"
+        )
+    if found:
+        yield Problem(
+            f"The camera only turns: {found}.",
+            "Nothing tells near from far; move the camera sideways, and check that its positions are in metres.",
+        )
+    if extent > MAX_EXTENT:
+        yield Problem(
+            f"The path of the camera spans {extent:,.0f} m.",
+            "Check that the positions are in metres and not in millimetres; of a path that really is so long, use a "
+            "part with --time-range.",
+        )
+    if depth_range and depth_range[1] > MAX_DEPTH_RATIO * depth_range[0]:
+        yield Problem(
+            f"The scene reaches from {depth_range[0]:.3g} m to {depth_range[1]:.3g} m.",
+            "Samples along rays are spread thin over such a range; state a narrower one with --depth-range NEAR FAR of "
+            "the data parser (metres).",
+        )
+
+
+def _rate_problems(silences: np.ndarray, bursts: np.ndarray, flag: str) -> Iterator[Problem]:
+    if len(silences):
+        begin, end = silences[np.argmax(silences[:, 1] - silences[:, 0])]
+        yield Problem(
+            f"The sensor is silent {_times(len(silences))} while the camera moves; the longest silence lasts "
+            f"{(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on.",
+            f"Lost events look like a scene without edges: use a part without ({flag}), or record fewer events with "
+            "higher thresholds or slower motion.",
+        )
+    if len(bursts):
+        yield Problem(
+            f"The event rate bursts {_times(len(bursts))}, first at {bursts[0, 0] * 1e-9:.2f} s, to over "
+            f"{BURST_RATIO} times the usual one, which the camera's motion does not explain.",
+            f"No static scene explains the events of a flash, of flicker or of a knock: use a part without ({flag}).",
+        )
+
+
+def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
+    few, many = sorted((statistics.num_on, statistics.num_off))
+    kind, other = ("on", "off") if statistics.num_on == many else ("off", "on")
+    if few == 0:
+        yield Problem(
+            f"All events are {kind} events.",
+            "Check how polarity is written (0 and 1, or -1 and 1), and that the sensor sends both.",
+        )
+    elif many > MAX_POLARITY_RATIO * few:
+        yield Problem(
+            f"There are {many / few:.1f} {kind} events for every {other} event.",
+            f"Raise the sensor's threshold of {kind} events; of this recording, check that polarity was read right and "
+            "that no light was switched or dimmed.",
+        )
+    if statistics.share_below_two > MAX_SHARE_BELOW_TWO:
+        yield Problem(
+            f"{100 * statistics.share_below_two:.0f} % of the pixels have fewer than two events.",
+            "Learning needs two events at a pixel: use a longer part, record more motion or more texture, or lower the "
+            "sensor's thresholds.",
+        )
+    if statistics.events_per_pixel < MIN_EVENTS_PER_PIXEL:
+        yield Problem(
+            f"There are only {statistics.events_per_pixel:.2g} events a pixel.",
+            f"A picture needs {MIN_EVENTS_PER_PIXEL} and more: use a longer part, record more motion or more texture, "
+            "or lower the sensor's thresholds.",
+        )
+    hot = statistics.num_hot_pixels
+    if hot > MAX_SHARE_HOT * statistics.counts.size:
+        yield Problem(
+            f"The sensor has {_count(hot, 'hot pixel')} ({percent(hot / statistics.counts.size)}), left out here.",
+            "If they lie on bright points of the scene, keep them with --keep-hot-pixels True; else raise the sensor's "
+            "thresholds, let it cool, or mask them in its settings.",
+        )
+
+
+def _cut_coordinates(statistics: EventStatistics) -> Iterator[Problem]:
+    """Coordinates of which 8 bits were kept: events end at 255, and not because nothing was to be seen there."""
+    for name, axis in (("x", 0), ("y", 1)):
+        counts = statistics.counts.sum(axis)
+        seen, beyond = counts[:256], counts[256:]
+        if len(beyond) and not beyond.any() and seen[-2:].mean() > MIN_SHARE_AT_CUT * np.median(seen):
+            yield Problem(
+                f"No event has {name} above 255, though the sensor has {len(counts)} pixels along it, and as many "
+                f"events have {name} = 255 as other values: {name} seems to be cut to 8 bits.",
+                f"Write {name} in 16 bits (numpy.uint16), anew from the source of the events.",
+            )
+
+
+def _coarse_times(recording: EventRecording) -> Iterator[Problem]:
+    """Times that went through float32, of which 24 bits are left: all of them are multiples of its spacing."""
+    index = index_events(recording)
+    times = np.unique(index.times[:: -(-len(index) // FLOAT_TIMES)].numpy())
+    times = times[np.abs(times) >= 2**24]
+    if len(times) < FEWEST_FLOAT_TIMES or (times.astype(np.float32).astype(np.int64) != times).any():
+        return
+    unit = int(np.gcd.reduce(times))
+    binary, spacing = unit & -unit, int(np.spacing(np.float32(np.abs(times).max())))
+    if unit == binary or binary < spacing:  # and not because they are whole microseconds, say
+        yield Problem(
+            f"The times of the events are numbers of single precision (float32), which at {times[-1] * 1e-9:.3g} s "
+            f"tell {spacing:,} ns apart and no less.",
+            "Write them as int64, or in double precision (float64), anew from their source.",
+        )
+
+
+def _frame_problems(frames: Frames | None) -> Iterator[Problem]:
+    if frames is None:
+        return
+    if len(frames.times) < MIN_FRAMES:
+        yield Problem(
+            f"There {'is' if len(frames.times) == 1 else 'are'} only {_count(len(frames.times), 'frame')}.",
+            "Some are held out to score: use a longer part, or learn from events alone.",
+        )
+    intervals = np.diff(frames.times)
+    if not len(intervals):
+        return
+    usual = np.median(intervals)
+    missing = int((np.rint(intervals / usual) - 1).clip(0).sum())
+    if missing > MAX_SHARE_DROPPED_FRAMES * (missing + len(frames.times)):
+        widest = np.argmax(intervals)
+        yield Problem(
+            f"In the sequence of frames {_count(missing, 'frame')} seem to be missing; they come every "
+            f"{usual * 1e-6:.3g} ms, but after {frames.times[widest] * 1e-9:.2f} s there is none for "
+            f"{intervals[widest] * 1e-9:.3g} s.",
+            "Look whether frames and events show the same at the same time: one lost file or stamp shifts all that "
+            "follow.",
+        )
+
+
+def _poses_used(recording: EventRecording, statistics: EventStatistics) -> slice:
+    """The poses around the events, at least two."""
+    times = recording.trajectory.times
+    first = np.searchsorted(times[:-1], statistics.edges[0], "right") - 1
+    return slice(int(first), int(np.searchsorted(times[1:], statistics.edges[-1], "left")) + 2)
+
+
+def _pose_steps(recording: EventRecording, statistics: EventStatistics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (ns) of the poses around the events, and radians and metres from each to the next."""
+    used = _poses_used(recording, statistics)
+    rotations = Rotation.from_quat(recording.trajectory.quaternions[used])
+    return recording.trajectory.times[used], *_steps(rotations, recording.trajectory.positions[used])
+
+
+def _steps(rotations: Rotation, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Radians and metres from each pose to the next."""
+    turns = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    return turns, np.linalg.norm(np.diff(positions, axis=0), axis=1)
+
+
+def _extent(recording: EventRecording, statistics: EventStatistics) -> float:
+    """Diagonal of the box around the path of the camera, metres."""
+    return float(np.linalg.norm(np.ptp(recording.trajectory.positions[_poses_used(recording, statistics)], axis=0)))
+
+
+def _viewing_distance(
+    recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
+) -> float:
+    """Metres to the scene: the middle of its range, else about as far as the path is long."""
+    return math.sqrt(depth_range[0] * depth_range[1]) if depth_range else _extent(recording, statistics) or 1.0
+
+
+def _spans(chosen: np.ndarray, edges: np.ndarray) -> Int64[np.ndarray, "spans 2"]:
+    """Begin and end of each run of bins that are chosen."""
+    return edges[np.flatnonzero(np.diff(chosen, prepend=False, append=False))].reshape(-1, 2)
+
+
+def _time_range_without(spans: np.ndarray, statistics: EventStatistics) -> str:
+    """The flag that selects the longest part of the events which none of the spans (ns) touches, in milliseconds."""
+    spans = spans[np.argsort(spans[:, 0])]
+    begins = np.maximum.accumulate(np.concatenate([statistics.edges[:1], spans[:, 1]]))
+    ends = np.concatenate([spans[:, 0], statistics.edges[-1:]])
+    longest = np.argmax(ends - begins)
+    begin, end = int(begins[longest]), int(ends[longest])
+    first, last = -(-begin // 10**6), end // 10**6
+    first += nanoseconds(first / 1e3) < begin
+    last -= nanoseconds(last / 1e3) > end
+    return f"--time-range {first / 1e3} {last / 1e3}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"
+
+
+def _times(number: int) -> str:
+    return "once" if number == 1 else f"{number:,} times"

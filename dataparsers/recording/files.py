@@ -1,0 +1,386 @@
+"""Files that recordings are made of: images, arrays, JSON; and files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+from jaxtyping import Float, Shaped, UInt8
+from PIL import Image, UnidentifiedImageError
+
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, UserError
+
+
+def expanded(path: Path | str) -> Path:
+    """A path that a user gave, with the home folder that ~ stands for.
+
+    Raises:
+        FlagError: That folder is unknown, or the path is not UTF-8, of which some libraries take no other.
+    """
+    try:
+        expanded = Path(path).expanduser()
+    except RuntimeError as error:
+        raise FlagError(f"{path} begins with a home folder that is not known; give the path without ~.") from error
+    try:
+        str(expanded).encode()
+    except UnicodeEncodeError as error:
+        raise FlagError(f"{expanded} holds bytes that are not UTF-8; rename it.") from error
+    return expanded
+
+
+def absolute(path: Path | str) -> Path:
+    """A path that a user gave, with ~ for a home folder, as an absolute one without links.
+
+    Raises:
+        FlagError: The home folder is unknown, the path is not UTF-8, or links lead in a circle.
+    """
+    try:
+        return expanded(expanded(path).resolve())
+    except (OSError, RuntimeError) as error:  # of which Python has raised either, depending on its version
+        raise FlagError(f"{path} cannot be followed (links that lead in a circle); give another path.") from error
+
+
+@contextmanager
+def of_file(path: Path | str) -> Iterator[None]:
+    """Says of a value that does not check itself as sound which file it came from.
+
+    Args:
+        path: The file or the folder; in words, a part of one, such as "camchain.yaml, cam0,".
+
+    Raises:
+        RecordingError: `path holds`, and what the ValueError of the block says.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except ValueError as error:
+        raise RecordingError(f"{path} holds {str(error).rstrip('.')}.") from error
+
+
+def check_is_file(path: Path, expected: str) -> None:
+    """Says so where something is there that is no file: whoever opens a pipe or a device may wait for ever.
+
+    Args:
+        path: Links are followed.
+        expected: What is expected there, such as "an HDF5 file with events".
+
+    Raises:
+        RecordingError: A folder, pipe, device or socket.
+    """
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "no regular file (but a pipe, a device or a socket)"
+        raise RecordingError(f"{path} is {what}; {expected} was expected there.")
+
+
+def check_is_folder(path: Path, expected: str) -> None:
+    """Says so where something is there that is no folder, in which nothing would be found.
+
+    Args:
+        path: Links are followed.
+        expected: What is expected there, such as "a folder of frames".
+
+    Raises:
+        RecordingError: A file of any kind.
+    """
+    if path.exists() and not path.is_dir():
+        raise RecordingError(f"{path} is no folder, but {expected} was expected there; rename it, or give its content.")
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[None]:
+    """Turns whatever a library raises at a damaged file into one sentence about it.
+
+    Args:
+        path: The file.
+        expected: What it is to hold, such as "an HDF5 file with events".
+
+    Raises:
+        RecordingError: Anything went wrong, or no file is there.
+    """
+    try:
+        check_is_file(path, expected)
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # of any kind, since libraries have their own for what is damaged
+        _check_can_be_read(path, expected)
+        told = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)  # which would be quoted
+        lines = told.strip().splitlines() or [type(error).__name__]
+        reason = lines[0].rstrip(".").replace(". ", ", ")
+        raise RecordingError(
+            f"{path} cannot be read as {expected} ({reason}); copy it again from its source."
+        ) from error
+
+
+def _check_can_be_read(path: Path, expected: str) -> None:
+    """Raises a RecordingError where nothing, or nothing but an empty file, or one that is not to be read, is there."""
+    try:
+        with open(path, "rb") as file:
+            is_empty = not file.read(1)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path} is missing; {expected} was expected there.") from error
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be opened ({error.strerror}); {expected} was expected, which you may read."
+        ) from error
+    if is_empty:
+        raise RecordingError(f"{path} is empty; {expected} was expected.")
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The text of a file, UTF-8 with or without a byte-order mark.
+
+    Args:
+        path: The file.
+        expected: What it is to hold, such as "JSON".
+
+    Raises:
+        RecordingError: The file is missing, cannot be read, or is no text.
+    """
+    with reading(path, expected):
+        return path.read_text(encoding="utf-8-sig")
+
+
+def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
+    """An image file with one or three channels and the values that it holds: uint8, uint16 or float32.
+
+    What is transparent is laid over white. What 16 bits and floats are of full brightness, the file does not say; see
+    `picture_depth`.
+
+    Raises:
+        RecordingError: The file is missing or cannot be decoded, or holds other values, or floats that are below 0 or
+            no numbers.
+    """
+    with reading(path, "an image"):
+        if is_deep(path):
+            return _load_deep(path)
+        with Image.open(path) as image:
+            image.verify()  # the checksums of a PNG, which decoding passes over
+        with Image.open(path) as image:
+            grey = image.mode in ("1", "L", "LA")
+            if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info:
+                colours = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), colours)
+            pixels = np.array(image.convert("L" if grey else "RGB"))
+        return pixels[..., None] if grey else pixels
+
+
+def is_deep(path: Path) -> bool:
+    """Whether an image has more than 8 bits a channel, from the header only.
+
+    Raises:
+        RecordingError: The file is missing.
+    """
+    with reading(path, "an image"):
+        try:
+            with Image.open(path) as image:
+                decoder = image.tile[0][3] if image.tile else ""
+                mode, *rest = decoder if isinstance(decoder, tuple) else (decoder,)
+                is_deep_ppm = image.format == "PPM" and bool(rest) and rest[0] > 255
+                return image.mode.startswith(("I", "F")) or ";16" in str(mode) or is_deep_ppm
+        except UnidentifiedImageError:  # such as TIFF with floats of three channels, which OpenCV reads
+            return True
+
+
+def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
+    """An image of more than 8 bits a channel, uint16 or float32; in the words of `load_image`."""
+    with suppress(UnidentifiedImageError), Image.open(path) as image:
+        image.verify()
+    stored = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise ValueError("its pixels cannot be decoded")
+    if stored.dtype not in (np.uint16, np.float32, np.float64):
+        raise RecordingError(
+            f"{path} holds values of type {stored.dtype}, but pictures of 8 or 16 bits, or of floats, were expected."
+        )
+    pixels = np.atleast_3d(stored)
+    if pixels.dtype.kind == "f":
+        pixels = pixels.astype(np.float32)
+        wrong = ~((pixels >= 0) & (pixels < np.inf))
+        if wrong.any():
+            raise RecordingError(
+                f"{path} holds a brightness of {pixels[wrong][0]:g}, but numbers from 0 on were expected; write 0 "
+                "where it is not known."
+            )
+    if pixels.shape[2] == 4:
+        white = 65535 if pixels.dtype == np.uint16 else 1.0
+        opacity = pixels[..., 3:] / np.float32(white)
+        laid = pixels[..., :3] * opacity + white * (1 - opacity)
+        pixels = (np.rint(laid) if pixels.dtype == np.uint16 else laid).astype(pixels.dtype)
+    return np.ascontiguousarray(pixels[..., ::-1])
+
+
+def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
+    """An image with three channels, equal ones where it is grey: [height, width], or with one channel."""
+    image = image if image.ndim == 3 else image[..., None]
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+
+
+def check_image_size(path: Path, width: int, height: int) -> None:
+    """Reads an image's header only.
+
+    Raises:
+        RecordingError: The file is missing, no image, or not of the size in pixels.
+    """
+    if (found := image_size(path)) != (width, height):
+        raise RecordingError(
+            f"{path} has {found[0]} x {found[1]} pixels, but {width} x {height} as of the sensor were expected."
+        )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, from the header only.
+
+    Raises:
+        RecordingError: The file is missing or no image.
+    """
+    with reading(path, "an image"):
+        try:
+            with Image.open(path) as image:
+                return image.size
+        except UnidentifiedImageError:
+            height, width, _ = _load_deep(path).shape
+            return width, height
+
+
+def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, "..."]:
+    """An array of real numbers from a .npy file.
+
+    Args:
+        path: The file.
+        mmap_mode: As of `numpy.load`; "r" to read the header only.
+
+    Raises:
+        RecordingError: The file is missing, or holds no such array.
+    """
+    with reading(path, "a NumPy array (.npy)"):
+        array = np.load(path, mmap_mode=mmap_mode)  # type: ignore[arg-type]
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")
+    return array
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file, with or without a byte-order mark.
+
+    Raises:
+        RecordingError: The file is missing or holds no JSON object.
+    """
+    with reading(path, "JSON"):
+        value = json.loads(read_text(path, "JSON"))
+    if not isinstance(value, dict):
+        raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
+    return value
+
+
+def fill_page(template: Path, **values: Any) -> str:
+    """A page of HTML from a Jinja template, in which values are escaped and a missing one is an error."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    templates = Environment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return templates.get_template(template.name).render(**values)
+
+
+def partial_of(path: Path) -> Path:
+    """A path beside another, for what becomes that one once it is whole. What processes of this machine that are gone
+    have left of such in the same folder is removed.
+
+    Args:
+        path: Of a file or folder; the name of the partial has the same suffix.
+    """
+    remove_leftovers(path.parent)
+    return path.with_name(f".{path.stem}{_mark()}{os.getpid()}{path.suffix}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes from a folder the partials (`partial_of`) of processes of this machine that are gone."""
+    mark = _mark()
+    with suppress(OSError):  # no folder yet, or none that may be looked into
+        for entry in os.scandir(folder):
+            number = entry.name.rpartition(mark)[2].partition(".")[0] if entry.name.startswith(".") else ""
+            if mark in entry.name and number.isdecimal() and not psutil.pid_exists(int(number)):
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
+
+
+def _mark() -> str:
+    """What the names of partials hold before the number of their process."""
+    return f".partial-{platform.node()}-"
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes a file so that it is whole or not there, or as it was before.
+
+    Args:
+        path: Its folder is made where it does not exist.
+        content: Text is encoded as UTF-8.
+
+    Raises:
+        OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+    """
+    write_together(path.parent, {path.name: content.encode() if isinstance(content, str) else content})
+
+
+def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] | None = None) -> None:
+    """Writes files and appends lines to tables, all or, if anything fails, none.
+
+    Args:
+        folder: That the paths begin at, and in which the partials lie.
+        files: What each file shall hold, by path; one that is there already is replaced.
+        lines: What is appended to each table of text, by path.
+
+    Raises:
+        OSError: The disk is full, or a folder cannot be written to; all is as it was before then, except that of
+            several files that are replaced some may be the new ones.
+    """
+    lines = lines or {}
+    partials = {path: partial_of(folder / path.replace("/", "-")) for path in files}
+    replaced = [path for path in files if (folder / path).exists()]
+    lengths = {path: (folder / path).stat().st_size for path in lines if (folder / path).exists()}
+    try:
+        for path, content in files.items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            partials[path].write_bytes(content)
+        for path, line in lines.items():
+            with open(folder / path, "ab", buffering=0) as table:
+                write_all(table, line.encode())
+        for path, partial in partials.items():
+            partial.replace(folder / path)
+    except BaseException:
+        for path in {*files, *lines}.difference(replaced, lengths):
+            (folder / path).unlink(missing_ok=True)
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
+        for path, length in lengths.items():
+            os.truncate(folder / path, length)
+        raise
+
+
+def write_all(file: FileIO, content: bytes) -> None:
+    """Writes to an unbuffered file, which may take less than it is given when the disk is nearly full.
+
+    Raises:
+        OSError: The disk is full; a part may be written.
+    """
+    left = memoryview(content)
+    while left:
+        left = left[file.write(left) :]

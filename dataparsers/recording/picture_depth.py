@@ -1,0 +1,88 @@
+"""What full brightness is in pictures of more than 8 bits, and pictures as brightness.
+
+A picture is uint8, of which 255 is full brightness, or float32 in [0, 1]; 8 bits stay as they are, since they need a
+quarter of the memory. Cameras of 10, 12 or 14 bits write files of 16 bits, whose largest value over the recording tells
+which of these it was. Picture by picture, brightness would jump from one to the next.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt8
+from PIL import Image
+from PIL.TiffImagePlugin import BITSPERSAMPLE, ImageFileDirectory_v2
+from rich.progress import track
+
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.files import is_deep, load_image
+
+DEPTHS = (8, 10, 12, 14, 16)
+"""Bits of a pixel that are told apart in files of 16."""
+
+
+@lru_cache(maxsize=16)
+def find_white_level(files: tuple[Path, ...]) -> float:
+    """The value of full brightness in pictures of one recording that have more than 8 bits; 255 where there are none.
+
+    Of whole numbers, the largest one of the fewest bits of `DEPTHS` that all values fit into, or what the header of a
+    file states. Of floats 1, or the largest value where that is above 1.
+
+    Args:
+        files: Of the recording; those of 8 bits are passed over.
+
+    Raises:
+        RecordingError: A file is missing or cannot be decoded, or some hold whole numbers and others floats.
+    """
+    largest, stated, kind = 0.0, 0.0, None
+    deep = [file for file in files if is_deep(file)]
+    for file in track(deep, "Looking for the depth of pictures", transient=True, disable=len(deep) < 2):
+        image = load_image(file)
+        if kind not in (None, image.dtype):
+            raise RecordingError(
+                f"{file} holds values of type {image.dtype}, but pictures before it hold {kind}; give pictures of one "
+                "kind."
+            )
+        kind, largest = image.dtype, max(largest, float(image.max()))
+        if kind == np.uint16:
+            stated = max(stated, _stated_white(file))
+            if max(largest, stated) >= 2 ** DEPTHS[-2]:
+                break
+    if kind == np.float32:
+        return max(largest, 1.0)
+    least = max(largest, stated)
+    return stated if stated == least else min(2.0**bits - 1 for bits in DEPTHS if 2**bits > least)
+
+
+def brightness(picture: Shaped[np.ndarray, "height width channels"]) -> Float32[np.ndarray, "height width channels"]:
+    """A picture in [0, 1]."""
+    return picture / np.float32(255) if picture.dtype == np.uint8 else picture
+
+
+def in_8_bits(picture: Shaped[np.ndarray, "height width channels"]) -> UInt8[np.ndarray, "height width channels"]:
+    """A picture as any program can show it."""
+    return picture if picture.dtype == np.uint8 else np.rint(255 * picture).astype(np.uint8)
+
+
+def _stated_white(file: Path) -> int:
+    """The largest value that the header of a file with 16 bits states; 0 where it states none.
+
+    That of PGM and PPM, of TIFF with 10, 12 or 14 bits, which OpenCV moves to the upper end of 16, and of PNG with a
+    chunk sBIT.
+    """
+    content = file.read_bytes()
+    if content[:2] in (b"P5", b"P6"):
+        with Image.open(file) as image:
+            return image.tile[0][3][1] if isinstance(image.tile[0][3], tuple) else 65535
+    if content[:4] in (b"II*\0", b"MM\0*"):
+        directory = ImageFileDirectory_v2(content[:8])
+        tags = BytesIO(content)
+        tags.seek(directory.next)
+        directory.load(tags)
+        bits = max(directory.get(BITSPERSAMPLE, (16,)))
+        return 2**16 - 2 ** (16 - bits) if bits < 16 else 0
+    place = content[: content.find(b"IDAT")].find(b"sBIT")
+    return 2 ** content[place + 4] - 1 if place > 0 else 0

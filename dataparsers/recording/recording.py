@@ -1,0 +1,557 @@
+"""A recording of an event camera, whatever format it was read from: events, frames, cameras and poses on one clock.
+
+These are values, checked where they are made; `enerf_ns.dataparsers.formats.registry` reads them from folders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int64, Shaped
+from PIL import Image
+
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import is_deep, load_array, load_image
+from enerf_ns.dataparsers.recording.picture_depth import find_white_level
+from enerf_ns.dataparsers.recording.pose_noise import pose_noise
+from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
+
+EVENTS_AT_A_TIME = 2**18
+"""Events that readers hand on at once: enough for speed, few enough to need hardly any memory."""
+
+LARGEST_SPAN_RATIO = 300
+"""Largest ratio between the spans of events or frames and poses; units of time differ by 1000."""
+
+LONGEST_REFRACTORY_PERIOD = 10**12
+"""Longest refractory period, nanoseconds."""
+
+CONTRAST_THRESHOLD_LIMITS = (1e-3, 10.0)
+"""Least and largest contrast threshold, change of log brightness. Sensors have more than ten times the least, below
+which events beyond number would follow; the largest is a change of brightness by e^10, 22,000 times."""
+
+DEPTH_LIMITS = (1e-6, 1e9)
+"""Least and largest depth, metres."""
+
+EXPOSURE_OVERLAP = 1.1
+"""Largest ratio between exposures and the time from frame to frame; stamps jitter."""
+
+LONGEST_EXPOSURE = 10**15
+"""Exposure, nanoseconds, beyond which all are too long alike."""
+
+SHORTEST_EXPOSURE = 1_000
+"""Shortest exposure, nanoseconds, but for 0; shorter ones are in another unit."""
+
+SHORTEST_FRAME_STEP = 1_000_000
+"""Shortest time from frame to frame, nanoseconds; frames closer together than this are in another unit if they also
+span hardly any of the poses."""
+
+
+@dataclass(frozen=True)
+class Events:
+    """Brightness changes in time order, one array a column."""
+
+    x: Int[np.ndarray, " events"]
+    """Columns of the pixels, of any integer type."""
+    y: Int[np.ndarray, " events"]
+    """Rows of the pixels, of any integer type."""
+    t: Int64[np.ndarray, " events"]
+    """Times in nanoseconds, never decreasing."""
+    p: Int[np.ndarray, " events"]
+    """Polarities: 1 where it became brighter; where it became darker, -1, or 0 or false as some formats write."""
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Pictures, one file each, with the camera that took them.
+
+    Raises:
+        ValueError: The exposures are not as their field says; a sentence that can follow "FILE holds".
+    """
+
+    filenames: tuple[Path, ...]
+    times: Int64[np.ndarray, " frames"]
+    """Times in nanoseconds, strictly increasing: the middle of each exposure."""
+    camera: Camera
+    trajectory: Trajectory
+    """Trajectory of the camera of the frames."""
+    depth_filenames: tuple[Path, ...] | None = None
+    """Depth maps, .npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was
+    hit."""
+    exposures: Int64[np.ndarray, " frames"] | None = None
+    """How long each was exposed, ns: 0 for an instant, else from `SHORTEST_EXPOSURE` to the time from frame to frame.
+    None where that is not known. A frame is the mean of what its camera saw meanwhile."""
+    numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Number of each frame in its folder, from 0; counted here unless given."""
+    downscale_factor: float = 1.0
+    """Pixels along the squares of which each becomes one pixel of a picture, at least 1."""
+    stated_white: float | None = None
+    """The value of full brightness in files of more than 8 bits, where the recording states it."""
+    files_of_recording: tuple[Path, ...] = ()
+    """All frames of the recording, which tell that value where it is not stated; `filenames` unless given."""
+
+    def __post_init__(self) -> None:
+        if not len(self.numbers):
+            object.__setattr__(self, "numbers", np.arange(len(self.times)))
+        if self.exposures is not None:
+            _check_exposures(self.times, self.exposures)
+
+    @property
+    def exposed(self) -> Int64[np.ndarray, "frames 2"]:
+        """First and last instant (ns) of each exposure; twice the time of the frame where it is not known."""
+        exposures = np.zeros_like(self.times) if self.exposures is None else self.exposures
+        opens = self.times - exposures // 2
+        return np.stack([opens, opens + exposures], axis=1)
+
+    @property
+    def picture_camera(self) -> Camera:
+        """The camera of the pictures: without distortion, downscaled."""
+        camera = self.camera.undistorted()
+        return camera if self.downscale_factor == 1.0 else camera.downscaled(self.downscale_factor)
+
+    @cached_property
+    def white_level(self) -> float:
+        """The value of full brightness in files of more than 8 bits.
+
+        Raises:
+            RecordingError: A file of the recording is missing or cannot be decoded.
+        """
+        return self.stated_white or find_white_level(self.files_of_recording or self.filenames)
+
+    @property
+    def white_in_words(self) -> str:
+        """What is taken as full brightness, to follow other words on the frames; empty for frames of 8 bits."""
+        return f", white is {self.white_level:g}" if is_deep(self.filenames[0]) else ""
+
+    def image(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
+        """A frame as its camera took it, with one or three channels: uint8, or float32 in [0, 1] of deeper files.
+
+        Raises:
+            RecordingError: The file is missing or cannot be decoded, or holds more than what is stated to be white.
+        """
+        image = load_image(self.filenames[index])
+        if image.dtype == np.uint8:
+            return image
+        if image.max() > self.white_level:
+            raise RecordingError(
+                f"{self.filenames[index]} holds {image.max():g}, but {self.white_level:g} is stated to be white; state "
+                "the largest value that the camera writes."
+            )
+        return image / np.float32(self.white_level)
+
+    def picture(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
+        """A frame as the `picture_camera` would have taken it; of the types of `image`.
+
+        Raises:
+            RecordingError: As of `image`.
+        """
+        return self.downscaled(self.camera.undistort(self.image(index)))
+
+    def downscaled(
+        self, image: Shaped[np.ndarray, "height width channels"]
+    ) -> Shaped[np.ndarray, "new_height new_width channels"]:
+        """An image of the size of the frames at that of the pictures, antialiased; uint8, or float32."""
+        if self.downscale_factor == 1.0:
+            return image
+        camera = self.picture_camera
+        right, lower = camera.width * self.downscale_factor, camera.height * self.downscale_factor
+        size, box = (camera.width, camera.height), (0.0, 0.0, right, lower)
+        parts = [image] if image.dtype == np.uint8 else np.split(image, image.shape[2], axis=2)
+        shown = [Image.fromarray(part[..., 0] if part.shape[2] == 1 else part) for part in parts]
+        small = [np.asarray(part.resize(size, Image.Resampling.HAMMING, box)) for part in shown]
+        return np.dstack(small)
+
+    def depth(self, index: int) -> Float32[np.ndarray, "height width"] | None:
+        """Depth along the optical axis in metres, 0 where it is unknown; of the middles of downscaled pixels.
+
+        Raises:
+            RecordingError: The file is missing or holds no array.
+        """
+        if self.depth_filenames is None:
+            return None
+        depth = load_array(self.depth_filenames[index]).astype(np.float32)
+        camera = self.picture_camera
+        rows, columns = (
+            ((np.arange(side) + 0.5) * self.downscale_factor).astype(int) for side in (camera.height, camera.width)
+        )
+        return depth[np.ix_(rows, columns)]
+
+    def with_exposure(self, exposure: int | None) -> Frames:
+        """The frames, all exposed for as long (ns), or for an unknown time."""
+        exposures = None if exposure is None else np.full(len(self.times), min(exposure, LONGEST_EXPOSURE))
+        return replace(self, exposures=exposures)
+
+    def subset(self, indices: Int[np.ndarray, " chosen"]) -> Frames:
+        """The frames at the given indices only."""
+        depth = self.depth_filenames and tuple(self.depth_filenames[i] for i in indices)
+        return replace(
+            self,
+            filenames=tuple(self.filenames[i] for i in indices),
+            times=self.times[indices],
+            depth_filenames=depth,
+            exposures=None if self.exposures is None else self.exposures[indices],
+            numbers=self.numbers[indices],
+            files_of_recording=self.files_of_recording or self.filenames,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class EventRecording:
+    """What a reader found in a folder. Frames outside the poses are dropped at once, events when they are indexed.
+
+    Raises:
+        RecordingError: The frames and the poses span times that do not fit together.
+        ValueError: A threshold, the refractory period, the colour filter, the response or the range of depth is not as
+            its field says; a sentence that can follow "FILE holds".
+    """
+
+    path: Path
+    format: str
+    """Name of the format, one of `enerf_ns.dataparsers.formats.registry`."""
+    camera: Camera
+    """Camera of the events."""
+    trajectory: Trajectory
+    """Trajectory of the event camera."""
+    stream_events: Callable[[], Iterator[Events]]
+    """Reads the events as they are in the files, in pieces of at most about `EVENTS_AT_A_TIME`. Every call starts again
+    and gives the same events, whatever a file has grown by since the reader looked at it."""
+    event_files: tuple[Path, ...]
+    """All files that the events come from."""
+    frames: Frames | None = None
+    """Sharp frames."""
+    blurred_frames: Frames | None = None
+    """Frames at the same instants as the sharp ones, blurred by motion, or reconstructed from events."""
+    reconstructed_by: str | None = None
+    """What reconstructed the blurred frames from events; None where a camera took them."""
+    held_out_frames: Frames | None = None
+    """Views for evaluation alone, on a trajectory and a clock of their own."""
+    contrast_thresholds: tuple[float, float] | None = None
+    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`, where the recording knows
+    them."""
+    refractory_period: int = 0
+    """For how long a pixel is blind after an event, ns; at most 1000 s."""
+    bayer_pattern: str | None = None
+    """Colours of the sensor's pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; None: a grey sensor."""
+    response: str | None = None
+    """How the sensor answers brightness, in the words of `enerf_ns.sensor.response`: linlog, or logarithm:OFFSET; None
+    where the recording does not state it."""
+    depth_range: tuple[float, float] | None = None
+    """Nearest and farthest depth in metres, within `DEPTH_LIMITS`, where the recording knows them."""
+    notes: tuple[str, ...] = ()
+    """What was dropped or renormalised, one sentence each; what is said of the events is with their index."""
+    shares_outside_poses: dict[str, float] = field(default_factory=dict)
+    """Share that is left out of "frames" and of "blurred frames" for lack of poses, where it is above 0."""
+    locate_event: Callable[[int], str] | None = None
+    """File and line of event number i of the stream, for error messages."""
+    num_events: int | None = None
+    """Number of events in the files, where that is known before they are read; for progress alone."""
+    time_range: tuple[int, int] | None = None
+    """First and last time (ns) of what is used of the recording."""
+    keep_hot_pixels: bool = False
+    """Whether pixels that fire far more often than their neighbourhood are used."""
+    keep_pose_gaps: bool = False
+    """Whether instants within the gaps of the trajectory are used."""
+    as_read: EventRecording | None = None
+    """The recording as it was read, of one whose poses or camera were refined: the events are the same."""
+    pose_noise_taken_off: tuple[float, float] | None = None
+    """Standard deviations along and about an axis, metres and radians, of the noise that was taken off the poses. None:
+    they were not smoothed."""
+    event_file_states: tuple[tuple[str, int, int, int], ...] = ()
+    """Path, size in bytes, and times of modification and of change (ns) of each of `event_files` when they were looked
+    at; taken here unless given."""
+
+    def __post_init__(self) -> None:
+        self._check_what_is_stated()
+        if not self.event_file_states:
+            states = [(file.resolve(), file.stat()) for file in self.event_files]
+            told = ((str(path), now.st_size, now.st_mtime_ns, now.st_ctime_ns) for path, now in states)
+            self._set(event_file_states=tuple(told))
+        self._set_files_of_recording()
+        notes, shares = [*self.notes], dict(self.shares_outside_poses)
+        covered = {
+            name: self._covered(getattr(self, name), what, notes, shares)
+            for name, what in (("frames", "frames"), ("blurred_frames", "blurred frames"))
+        }
+        self._set(**covered, notes=tuple(notes), shares_outside_poses=shares)
+
+    def selected(
+        self,
+        time_range: tuple[float, float] | None,
+        keep_hot_pixels: bool,
+        keep_pose_gaps: bool = False,
+        undistort: bool = True,
+        smooth_poses: bool = False,
+    ) -> EventRecording:
+        """The recording of which a part of the events is used; for one selection always the same object.
+
+        Args:
+            time_range: First and last time in seconds on the recording's clock, or None for all.
+            keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
+            keep_pose_gaps: Use instants within the gaps of the trajectory.
+            undistort: Believe the distortion of the cameras; otherwise they have none.
+            smooth_poses: Take the noise off the poses (`pose_noise`).
+
+        Raises:
+            FlagError: The range holds no poses, or lies within a gap that is left out.
+        """
+        range_ns = time_range and (nanoseconds(time_range[0]), nanoseconds(time_range[1]))
+        selection = self
+        chosen = range_ns, keep_hot_pixels, keep_pose_gaps
+        if chosen != (self.time_range, self.keep_hot_pixels, self.keep_pose_gaps):
+            selection = _with_selection(self, *chosen)
+        if not undistort:
+            selection = _without_lenses(selection)
+        if smooth_poses:
+            selection = _with_smooth_poses(selection)
+        start, end = selection.span
+        if time_range is not None and not start < end:
+            raise FlagError(
+                f"--time-range {time_range[0]:g} {time_range[1]:g} (seconds) holds none of the poses of "
+                f"{self.path}, which lie from {seconds(self.trajectory.start)} to {seconds(self.trajectory.end)}."
+            )
+        if not len(selection.stretches):
+            ((begin, after),) = selection.pose_gaps
+            raise FlagError(
+                f"The time range lies within a gap of the poses of {self.path}, from {seconds(begin)} to "
+                f"{seconds(after)}; give another --time-range, or use it with --keep-pose-gaps True."
+            )
+        return selection
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last time (ns) that is used: of the poses, within the range that was selected."""
+        start, end = self.time_range or (self.trajectory.start, self.trajectory.end)
+        return max(start, self.trajectory.start), min(end, self.trajectory.end)
+
+    @property
+    def pose_gaps(self) -> Int64[np.ndarray, "gaps 2"]:
+        """Those of `Trajectory.gaps` that reach into the span, whether they are kept or not."""
+        (start, end), gaps = self.span, self.trajectory.gaps
+        return gaps[(gaps[:, 0] < end) & (gaps[:, 1] > start)]
+
+    @property
+    def stretches(self) -> Int64[np.ndarray, "stretches 2"]:
+        """First and last instant (ns) of each part of the span that is used: all, or what lies between the gaps."""
+        start, end = self.span
+        gaps = self.pose_gaps[: 0 if self.keep_pose_gaps else None]
+        stretches = np.concatenate([[start], gaps.flatten(), [end]]).reshape(-1, 2)
+        return stretches[stretches[:, 0] <= stretches[:, 1]]
+
+    def instants(self, number: int) -> Int64[np.ndarray, " number"]:
+        """Instants (ns) spread evenly over the `stretches`, at least 2, from their first to their last."""
+        return self._instants_at(evenly_spaced(0, self._num_instants - 1, number))
+
+    def spans(self, number: int, share: float) -> Int64[np.ndarray, "number 2"]:
+        """First and last instant (ns) of spans, equally long and spread evenly over the `stretches`.
+
+        Args:
+            number: Of the spans.
+            share: Of the instants of the stretches that all spans have together, above 0 and at most 1.
+        """
+        length = max(int(share * self._num_instants) // number, 1)
+        middles = (2 * np.arange(number) + 1) * self._num_instants // (2 * number)
+        begins = (middles - length // 2).clip(0)
+        return np.column_stack([self._instants_at(begins), self._instants_at(begins + length - 1)])
+
+    @property
+    def _num_instants(self) -> int:
+        begins, ends = self.stretches.T
+        return int((ends - begins + 1).sum())
+
+    def _instants_at(self, places: Int64[np.ndarray, " places"]) -> Int64[np.ndarray, " places"]:
+        """Instants (ns) of the stretches by their number, from 0."""
+        begins, ends = self.stretches.T
+        after = np.cumsum(ends - begins + 1)
+        return places + (ends + 1 - after)[np.searchsorted(after, places, "right")]
+
+    def in_left_out_gaps(self, times: Int64[np.ndarray, " times"]) -> Bool[np.ndarray, " times"]:
+        """Which times (ns) lie in gaps of the poses and are therefore not used; none where gaps are kept."""
+        return self.trajectory.in_gaps(times) & (not self.keep_pose_gaps)
+
+    def knows_poses(self, frames: Frames) -> Bool[np.ndarray, " frames"]:
+        """Which frames have poses throughout their exposure, outside the gaps that are not used."""
+        opens, closes = frames.exposed.T
+        covered = frames.trajectory.covers(opens) & frames.trajectory.covers(closes)
+        return covered & (self.keep_pose_gaps | ~frames.trajectory.in_gaps(opens, closes))
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether there are frames of any kind."""
+        return self.frames is not None or self.blurred_frames is not None
+
+    def locate(self, index: int) -> str:
+        """File and line, or number, of an event of the stream, for error messages."""
+        return self.locate_event(index) if self.locate_event else f"{self.path}, event {index + 1},"
+
+    def __deepcopy__(self, memo: dict) -> EventRecording:
+        """The recording itself: it is read-only and large, and Nerfstudio copies what it hands to data sets."""
+        return self
+
+    def _check_what_is_stated(self) -> None:
+        on, off = self.contrast_thresholds or (1.0, 1.0)
+        least, largest = CONTRAST_THRESHOLD_LIMITS
+        if not (least <= on <= largest and least <= off <= largest):
+            raise ValueError(
+                f"the contrast thresholds {on:g} (of on events) and {off:g} (of off events), but both must be from "
+                f"{least:g} to {largest:g}."
+            )
+        if not 0 <= self.refractory_period <= LONGEST_REFRACTORY_PERIOD:
+            raise ValueError(
+                f"the refractory period {self.refractory_period:g} ns, but from 0 to {LONGEST_REFRACTORY_PERIOD:g} ns "
+                "were expected."
+            )
+        pattern = self.bayer_pattern
+        if pattern is not None and not (isinstance(pattern, str) and len(pattern) == 4 and set(pattern) <= set("RGB")):
+            raise ValueError(
+                f"the Bayer pattern {pattern!r}, but four letters of R, G and B, the colours of the pixels (0, 0), "
+                "(1, 0), (0, 1) and (1, 1), such as RGGB, were expected."
+            )
+        if self.response is not None and not _is_response(self.response):
+            raise ValueError(
+                f"the response {self.response!r}, but linlog, or logarithm:OFFSET with an offset above 0, such as "
+                "logarithm:0.001, was expected."
+            )
+        if not isinstance(self.reconstructed_by, str | None):
+            raise ValueError(f"reconstructed_by = {self.reconstructed_by!r}, but a text was expected.")
+        near, far = self.depth_range or (1.0, 2.0)
+        if not DEPTH_LIMITS[0] <= near < far <= DEPTH_LIMITS[1]:
+            raise ValueError(
+                f"the range of depth {near:g} m to {far:g} m, but the nearest and, farther than that, the farthest "
+                f"depth, both from {DEPTH_LIMITS[0]:g} m to {DEPTH_LIMITS[1]:g} m, were expected."
+            )
+
+    def _set(self, **values: object) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _set_files_of_recording(self) -> None:
+        """Has frames of all kinds take the same value for white."""
+        kinds = ("frames", "blurred_frames", "held_out_frames")
+        all_frames = {kind: frames for kind in kinds if (frames := getattr(self, kind)) is not None}
+        files = tuple(file for frames in all_frames.values() for file in frames.filenames)
+        for kind, frames in all_frames.items():
+            if not frames.files_of_recording:
+                self._set(**{kind: replace(frames, files_of_recording=files)})
+
+    def _covered(self, frames: Frames | None, what: str, notes: list[str], shares: dict[str, float]) -> Frames | None:
+        """The frames within the poses; says in notes and shares what was left out."""
+        if frames is None:
+            return None
+        steps, poses = np.diff(frames.times), frames.trajectory.end - frames.trajectory.start
+        too_long = steps.sum() > LARGEST_SPAN_RATIO * poses
+        too_short = len(steps) and np.median(steps) < SHORTEST_FRAME_STEP and LARGEST_SPAN_RATIO * steps.sum() < poses
+        if too_long or too_short:
+            raise RecordingError(
+                f"{self.path} holds {what} within {steps.sum() * 1e-9:.6g} s and poses within {poses * 1e-9:.6g} s, "
+                "which does not fit together; state the times of both in the unit that the format asks for."
+            )
+        inside = np.flatnonzero(frames.trajectory.covers(frames.times))
+        dropped = len(frames.times) - len(inside)
+        if not dropped:
+            return frames
+        notes.append(left_out(dropped, len(frames.times), what))
+        shares[what] = dropped / len(frames.times)
+        return frames.subset(inside) if len(inside) else None
+
+
+def _check_exposures(times: Int64[np.ndarray, " frames"], exposures: Int64[np.ndarray, " exposures"]) -> None:
+    if len(exposures) != len(times):
+        raise ValueError(f"{len(exposures)} exposures of {len(times)} frames, but one of each was expected.")
+    wrong = (exposures < 0) | ((0 < exposures) & (exposures < SHORTEST_EXPOSURE))
+    if wrong.any():
+        raise ValueError(
+            f"the exposure {exposures[wrong][0]} ns, but 0, or at least {SHORTEST_EXPOSURE} ns, was expected."
+        )
+    steps, means = np.diff(times), (exposures[:-1] + exposures[1:]) / 2
+    wrong = means > EXPOSURE_OVERLAP * steps
+    if wrong.any():
+        raise ValueError(
+            f"exposures of {means[wrong][0] * 1e-6:g} ms of frames that are {steps[wrong][0] * 1e-6:g} ms apart, but "
+            "exposures up to the time from frame to frame were expected."
+        )
+
+
+def _is_response(name: object) -> bool:
+    """Whether a text has the form of a response's name, whatever offsets a sensor allows."""
+    if name == "linlog":
+        return True
+    kind, _, offset = name.partition(":") if isinstance(name, str) else ("", "", "")
+    try:
+        return kind == "logarithm" and 0 < float(offset) < np.inf
+    except ValueError:
+        return False
+
+
+@cache
+def _with_selection(
+    recording: EventRecording, time_range: tuple[int, int] | None, keep_hot_pixels: bool, keep_pose_gaps: bool
+) -> EventRecording:
+    return replace(recording, time_range=time_range, keep_hot_pixels=keep_hot_pixels, keep_pose_gaps=keep_pose_gaps)
+
+
+@cache
+def _with_smooth_poses(recording: EventRecording) -> EventRecording:
+    noise = pose_noise(recording.trajectory)
+    if noise is None:
+        return recording
+    smooth = {id(recording.trajectory): noise.smooth}
+
+    def of(frames: Frames | None) -> Frames | None:
+        if frames is None:
+            return None
+        own = frames.trajectory
+        if id(own) not in smooth:
+            found = pose_noise(own)
+            smooth[id(own)] = own if found is None else found.smooth
+        return replace(frames, trajectory=smooth[id(own)])
+
+    frames, blurred = of(recording.frames), of(recording.blurred_frames)
+    taken_off = noise.position, noise.rotation
+    return replace(
+        recording, trajectory=noise.smooth, frames=frames, blurred_frames=blurred, pose_noise_taken_off=taken_off
+    )
+
+
+@cache
+def _without_lenses(recording: EventRecording) -> EventRecording:
+    kinds = ("frames", "blurred_frames", "held_out_frames")
+    frames = {kind: getattr(recording, kind) for kind in kinds}
+    frames = {kind: value and replace(value, camera=value.camera.without_lens()) for kind, value in frames.items()}
+    return replace(recording, camera=recording.camera.without_lens(), **frames)
+
+
+def overlaps(one: Int64[np.ndarray, "ones 2"], other: Int64[np.ndarray, "others 2"]) -> Int64[np.ndarray, "overlaps 2"]:
+    """First and last instant of each part of time that lies in both, each in order and apart."""
+    begins = np.maximum(one[:, None, 0], other[:, 0])
+    ends = np.minimum(one[:, None, 1], other[:, 1])
+    return np.stack([begins, ends], axis=-1)[begins <= ends]
+
+
+def left_out(dropped: int, total: int, what: str) -> str:
+    """A note about frames or events that lie outside the poses."""
+    return f"{dropped:,} of {total:,} {what} ({percent(dropped / total)}) lie outside the poses and are left out."
+
+
+def percent(share: float) -> str:
+    """A share in [0, 1] as it is shown, with two digits and never as a power of ten."""
+    value = 100 * share
+    if 0 < value < 0.01:
+        return "less than 0.01 %"
+    return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
+
+
+def nanoseconds(time: float) -> int:
+    """A time in seconds, as a user gives it, in nanoseconds."""
+    return round(time * 1e9)
+
+
+def seconds(time: int) -> str:
+    """A time in nanoseconds as it is shown."""
+    return f"{int(time) * 1e-9:.6f} s"

@@ -1,0 +1,321 @@
+"""How near and how far the scene lies, from events and poses alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from rich.progress import track
+
+from enerf_ns.dataparsers.compiled import compiled
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
+
+GRID_WIDTH = 240  # at most, of the view that votes are cast into: coarse enough for the number of events
+TILE = 16
+EVENTS_PER_SWEEP = 20_000
+DISPARITIES = np.concatenate([np.arange(0.0, 8.0, 0.5), np.arange(8.0, 65.0)])  # grid pixels
+SMALLEST_DISPARITY, LARGEST_DISPARITY = 2.0, 60.0  # of a peak inside the swept range
+MIN_PEAK = 2.5  # of the dispersion of votes, relative to its median over the planes
+MIN_GAIN = 1.5  # relative to the plane at infinity
+MIN_VOTES = 0.1  # a grid pixel
+
+FARTHEST_DISPARITY = 8.0
+"""Grid pixels by which the farthest depth of a range should move against infinity, so that the two are told apart."""
+
+MIN_TILES = 20
+"""Fewest tiles with a depth that show parallax; of cameras that only turn, chance makes a dozen look so."""
+
+MIN_CHANCE_RATIO = 3.0
+"""Least ratio of tiles with a depth to tiles that look so by chance; for cameras that only turn it stays below 2."""
+
+EVENTS_FOR_DEPTH = 4_000_000
+"""Number of events that measure the depth of the scene, where there are more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parallax:
+    """What the events of a moving camera show of near and far; its planes behind the camera are the control."""
+
+    depths: Float64[np.ndarray, " tiles"]
+    """Metres, along the optical axis, of all tiles whose votes pile up clearly at one plane."""
+    num_by_chance: int
+    """Tiles whose votes pile up as clearly behind the camera, where nothing is seen: as many of `depths` are wrong."""
+    num_at_infinity: int
+    """Tiles whose votes pile up clearly at infinity, so that the camera's rotation alone explains them."""
+    extent: float
+    """Diagonal of the box around the camera's path, metres."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there are more depths than chance explains."""
+        return len(self.depths) > MIN_TILES + MIN_CHANCE_RATIO * self.num_by_chance
+
+    @property
+    def is_ruled_out(self) -> bool:
+        """Whether the camera is seen to turn only, or the scene to be far beyond the reach of its motion."""
+        moves = self.extent > 0 and self.num_at_infinity <= len(self.depths) + self.num_by_chance
+        return not self.is_shown and not moves
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """0.7 times the 2nd and 1.4 times the 98th percentile of the depths, metres."""
+        near, far = np.percentile(self.depths, [2, 98])
+        return 0.7 * float(near), 1.4 * float(far)
+
+
+def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Nearest and farthest depth in metres: the one stated, the recording's own, or measured from its events.
+
+    Raises:
+        FlagError: What is stated is no range.
+        RecordingError: The events do not show how deep the scene is.
+    """
+    if stated is None:
+        return recording.depth_range or _measured_depth_range(recording)
+    near, far = stated
+    if not 0.0 < near < far < np.inf:
+        raise FlagError(f"{recording.path}: the depth range is {near} to {far} m; expected 0 < near < far")
+    return near, far
+
+
+def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
+    parallax = recording_parallax(recording)
+    if not parallax.is_shown:
+        found = "the camera only turns: " if parallax.is_ruled_out else ""
+        raise RecordingError(
+            f"{recording.path}: the depth range of the scene cannot be measured, because {found}its path spans "
+            f"{parallax.extent:.3g} m, and its events show no parallax; state the range with --depth-range NEAR FAR of "
+            "the data parser (metres)."
+        )
+    return parallax.depth_range
+
+
+@cache
+def recording_parallax(recording: EventRecording) -> Parallax:
+    """What a recording's events show of near and far; takes seconds, and is done once for a recording in a process."""
+    return measure_parallax(_posed_events(recording), recording.camera, recording.trajectory)
+
+
+@cache
+def share_beyond(recording: EventRecording, depth_range: tuple[float, float]) -> float:
+    """Share of a recording's events that come from beyond a range of depth (nearest, farthest; metres), 0 to 1.
+
+    See `measure_share_beyond`; it takes a second, and is done once for a recording and a range in a process.
+    """
+    return measure_share_beyond(_posed_events(recording), recording.camera, recording.trajectory, depth_range)
+
+
+def _posed_events(recording: EventRecording) -> Events:
+    """Some of the events, outside the gaps of the poses that are left out."""
+    events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
+    posed = ~recording.in_left_out_gaps(events.t)
+    return Events(events.x[posed], events.y[posed], events.t[posed], events.p[posed])
+
+
+def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> Parallax:
+    """At which depths the event camera saw the scene, and how much of that is chance.
+
+    A space sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018): the viewing rays of the events of
+    an edge meet where the edge is. Rays from within half a baseline of a reference view are cut by planes parallel to
+    its image, evenly spaced in disparity. Where the cuts pile up is told, for each tile of the view, by the dispersion
+    (variance over mean) of their counts; the variance is the objective of Gallego et al., "A Unifying Contrast
+    Maximization Framework", CVPR 2018. Nothing depends on the unit of length: baselines are the extent of the camera's
+    path and its halvings. The same planes behind the camera, where rays of a scene never meet, are the control: where
+    there is no parallax, or only noise of the poses, votes pile up there as often as in front.
+
+    Args:
+        events: In time order, within the span of the trajectory.
+        camera: Of the events.
+        trajectory: Of that camera.
+    """
+    path = _path(events, trajectory)
+    extent, depths, num_by_chance, num_at_infinity = _extent(path[1]), [np.empty(0)], 0, 0
+    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True)
+    planes = np.concatenate([DISPARITIES, -DISPARITIES])
+    for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
+        ahead, behind = np.split(sweep, 2, axis=1)
+        depths.append(baseline * grid_focal_length(camera) / _clear_disparities(*ahead))
+        num_by_chance += len(_clear_disparities(*behind))
+        num_at_infinity += _num_at_infinity(*sweep)
+    return Parallax(np.concatenate(depths), num_by_chance, num_at_infinity, extent)
+
+
+def measure_share_beyond(
+    events: Events, camera: Camera, trajectory: Trajectory, depth_range: tuple[float, float]
+) -> float:
+    """Share of the events that no depth of a range explains, since they come from beyond it; 0 to 1.
+
+    The sweep of `measure_parallax`, at one baseline, at which the farthest depth lies FARTHEST_DISPARITY from infinity.
+    A tile's votes lie beyond where they pile up more at some plane between the farthest depth and infinity than at all
+    planes of the range; ties of noise go to the range, which has more planes.
+
+    Args:
+        events: In time order, within the span of the trajectory.
+        camera: Of the events.
+        trajectory: Of that camera.
+        depth_range: Nearest and farthest depth, metres.
+
+    Returns:
+        0 also where the camera moves too little to tell the farthest depth from infinity.
+    """
+    near, far = depth_range
+    path, focal = _path(events, trajectory), grid_focal_length(camera)
+    baseline = min(_extent(path[1]), FARTHEST_DISPARITY * far / focal)
+    farthest = baseline * focal / far
+    if farthest < SMALLEST_DISPARITY:
+        return 0.0
+    nearest = min(baseline * focal / near, GRID_WIDTH)
+    planes = np.append(np.arange(0.0, FARTHEST_DISPARITY, 0.5), np.arange(FARTHEST_DISPARITY, nearest + 1))
+    votes_beyond = votes_of_all = 0.0
+    for _, (dispersion, votes) in _sweeps(events, camera, trajectory, path, [baseline], planes):
+        enough = votes[0] > MIN_VOTES
+        beyond = dispersion[planes < farthest].max(0) > dispersion[planes >= farthest].max(0)
+        votes_beyond += votes[0, enough & beyond].sum()
+        votes_of_all += votes[0, enough].sum()
+    return float(votes_beyond / votes_of_all) if votes_of_all else 0.0
+
+
+def _path(events: Events, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Times (ns) evenly spread over the events, and the places of the camera then (metres); none without events."""
+    if not len(events):
+        return np.empty(0, np.int64), np.empty((0, 3))
+    path_times = evenly_spaced(events.t[0], events.t[-1], 2000)
+    path_times = path_times[trajectory.in_gaps(events.t).any() | ~trajectory.in_gaps(path_times)]
+    return path_times, trajectory.poses(torch.from_numpy(path_times))[:, :, 3].numpy()
+
+
+def _sweeps(
+    events: Events,
+    camera: Camera,
+    trajectory: Trajectory,
+    path: tuple[np.ndarray, np.ndarray],
+    baselines: Iterable[float],
+    disparities: Float64[np.ndarray, " planes"],
+) -> Iterator[tuple[float, Float64[np.ndarray, "2 planes tiles"]]]:
+    """Each baseline (metres) with what `sweep_planes` found of each of its reference views; none if nothing moves."""
+    if not _extent(path[1]):
+        return
+    directions, generator = camera.pixel_directions(), np.random.default_rng(0)
+    references = events.t[len(events) // 24 :: len(events) // 12 + 1]
+    for baseline in baselines:
+        for reference in references:
+            chosen = _events_seen_within(baseline / 2, reference, events, *path)
+            if len(chosen) > EVENTS_PER_SWEEP:
+                chosen = generator.choice(chosen, EVENTS_PER_SWEEP, replace=False)
+            rays, centres = rays_in_view(
+                directions[events.y[chosen], events.x[chosen]],
+                trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
+                trajectory.poses(torch.as_tensor(reference)).numpy(),
+            )
+            yield baseline, sweep_planes(rays, centres / baseline, camera, disparities)
+
+
+def _extent(path: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
+
+
+def grid_focal_length(camera: Camera) -> float:
+    """Focal length in grid pixels."""
+    return camera.fx * grid_scale(camera)
+
+
+def grid_scale(camera: Camera) -> float:
+    """Grid pixels a pixel; a grid finer than the sensor would show the sensor's own pixels as a pattern."""
+    return min(GRID_WIDTH / camera.width, 1.0)
+
+
+def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
+    """Indices of the events around a time, while the camera stays within a radius (metres) of its place then."""
+    now = np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1)
+    outside = np.flatnonzero(np.linalg.norm(path - path[now], axis=1) > radius)
+    limits = np.concatenate([[0], outside, [len(path_times) - 1]])
+    after = np.searchsorted(limits, now)
+    first, last = np.searchsorted(events.t, path_times[limits[after - 1 : after + 1]])
+    return np.arange(first, last)
+
+
+def rays_in_view(
+    directions: Float64[np.ndarray, "rays 3"],
+    poses: Float64[np.ndarray, "rays 3 4"],
+    view: Float64[np.ndarray, "3 4"],
+) -> tuple[Float64[np.ndarray, "rays 3"], Float64[np.ndarray, "rays 3"]]:
+    """Directions (z = 1) and centres of rays in the axes of a view; rays that hardly go its way are left out."""
+    rays = np.einsum("nij,nj->ni", poses[:, :, :3], directions) @ view[:, :3]
+    centres = (poses[:, :, 3] - view[:, 3]) @ view[:, :3]
+    ahead = rays[:, 2] > 0.1
+    return rays[ahead] / rays[ahead, 2:], centres[ahead]
+
+
+def sweep_planes(
+    rays: Float64[np.ndarray, "rays 3"],
+    centres: Float64[np.ndarray, "rays 3"],
+    camera: Camera,
+    disparities: Float64[np.ndarray, " planes"],
+) -> Float64[np.ndarray, "2 planes tiles"]:
+    """Dispersion of the votes, and votes a grid pixel, of each tile of the view at each plane.
+
+    A ray a (z = 1) from c meets the plane of depth z at c + (z - c_z) a, which the view sees at a + (c - c_z a) / z.
+    """
+    scale, focal = grid_scale(camera), grid_focal_length(camera)
+    columns, rows = (round(side * scale) // TILE for side in (camera.width, camera.height))
+    start = focal * rays[:, :2] + np.array([camera.cx, camera.cy]) * scale
+    drift = centres[:, :2] - centres[:, 2:] * rays[:, :2]
+    votes, squares = np.zeros((2, len(disparities), rows * columns))
+    approach, counts = np.ascontiguousarray(centres[:, 2]) / focal, np.empty((rows * TILE, columns * TILE))
+    compiled(_vote)(start, drift, approach, disparities, counts, votes, squares)
+    votes, squares = votes / TILE**2, squares / TILE**2
+    return np.stack([(squares - votes**2) / np.maximum(votes, 1e-9), votes])
+
+
+def _vote(start, drift, approach, disparities, counts, votes, squares):
+    """Adds up, for each plane and tile, the votes of all rays and the squares of the counts of its grid pixels."""
+    height, width = counts.shape
+    for plane, disparity in enumerate(disparities):
+        counts[:] = 0.0
+        for ray in range(len(start)):
+            x = start[ray, 0] + disparity * drift[ray, 0] + 0.5
+            y = start[ray, 1] + disparity * drift[ray, 1] + 0.5
+            if 0.0 <= x < width and 0.0 <= y < height:  # magnification shall not look like focus
+                counts[int(y), int(x)] += (1.0 - disparity * approach[ray]) ** 2
+        for row in range(height):
+            for column in range(width // TILE):
+                vote, square = 0.0, 0.0
+                for x in range(column * TILE, (column + 1) * TILE):
+                    count = counts[row, x]
+                    vote += count
+                    square += count * count
+                tile = row // TILE * (width // TILE) + column
+                votes[plane, tile] += vote
+                squares[plane, tile] += square
+
+
+def _clear_disparities(
+    dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
+) -> Float64[np.ndarray, " clear"]:
+    """Disparities, of DISPARITIES, of the tiles whose votes pile up clearly at one plane."""
+    peak = dispersion.argmax(0)[None]
+    disparity = DISPARITIES[peak]
+    clear = (
+        (dispersion.max(0) > np.maximum(MIN_PEAK * np.median(dispersion, 0), MIN_GAIN * dispersion[0]))
+        & (np.take_along_axis(votes, peak, 0) > MIN_VOTES)
+        & (disparity >= SMALLEST_DISPARITY)
+        & (disparity <= LARGEST_DISPARITY)
+    )
+    return disparity[clear]
+
+
+def _num_at_infinity(
+    dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
+) -> int:
+    """Number of tiles whose votes pile up clearly at infinity, in front and behind."""
+    peak = dispersion.argmax(0)
+    clear = (dispersion.max(0) > MIN_PEAK * np.median(dispersion, 0)) & (votes[0] > MIN_VOTES)
+    return np.count_nonzero(clear & (DISPARITIES[peak % len(DISPARITIES)] < SMALLEST_DISPARITY))

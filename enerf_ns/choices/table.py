@@ -1,0 +1,90 @@
+"""What training prints: what the recording holds, what is made of it, and what was found to be wrong with its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from enerf_ns.choices.resolver import Choice
+from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.inspection.problems import find_problems
+from enerf_ns.dataparsers.recording.errors import printable
+from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
+from enerf_ns.poses.findings import Finding
+
+PREFIX = "--pipeline."
+"""What flags begin with, said once below a table."""
+
+
+def recording_table(parser: EventDataParserConfig) -> Table:
+    """What a recording holds, and where its scene is taken to lie."""
+    recording = parser.setup().recording()
+    index, camera = index_events(recording), recording.camera
+    first, last = index.span
+    seconds = max(last - first, 1) * 1e-9
+    depth = parser.depth_range
+    rows = {
+        "folder": f"{recording.path} ({recording.format})",
+        "events": f"{len(index):,}, {100 * index.num_positive / len(index):.0f} % on",
+        "span": f"{seconds:.2f} s",
+        "rate": f"{len(index) / seconds / 1e6:.2f} million events/s, "
+        f"{len(index) / (camera.width * camera.height):.1f} a pixel",
+        "sensor": f"{camera.width} x {camera.height}, {camera.model}",
+        "poses": f"{len(recording.trajectory.times):,}",
+    }
+    for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
+        if frames is None:
+            rows[name] = "none"
+            continue
+        depth_note = ", with depth" if frames.depth_filenames else ""
+        rows[name] = (
+            f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}{frames.white_in_words}"
+        )
+    if depth is not None:
+        _, scale, box = scene_normalisation(recording, *depth, parser.box)
+        rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
+        rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"
+    table = Table(title="Recording", show_header=False, title_justify="left")
+    for name, value in rows.items():
+        table.add_row(name, Text(printable(value)))
+    for note in (*recording.notes, *index.notes):
+        table.add_row("note", Text(printable(note), "yellow"))
+    for problem in find_problems(recording, depth):
+        what, advice = printable(problem.what), printable(problem.advice)
+        table.add_row(Text("problem", "red"), Text.assemble((what, "red"), f" {advice}"))
+    return table
+
+
+def choices_table(choices: Sequence[Choice]) -> Table:
+    """What is kept and what is left out, why, and by which flag it is forced."""
+    caption = f"forced by {PREFIX}FLAG VALUE, those of event-data at the end"
+    table = _table("Parts of the method", caption, ("part", "", "what", "why", "flag"))
+    for choice in choices:
+        kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
+        flag = Text(choice.flag.removeprefix(PREFIX), "dim")
+        table.add_row(choice.part, kept, Text(choice.value), Text(choice.why), flag)
+    return table
+
+
+def findings_table(found: Sequence[Finding]) -> Table:
+    """What was found to be wrong with clock, poses and lens, and by how much that moves the picture."""
+    caption = f"forced or forbidden by {PREFIX}FLAG True or False"
+    table = _table("Clock, poses and lens", caption, ("part", "", "found", "moves the picture by", "flag"))
+    for row in found:
+        kept = "[green]corrected[/green]" if row.is_corrected else "[dim]as stated[/dim]"
+        value = row.value if row.is_told else f"not told ({row.value})"
+        moved = f"{row.pixels:.2g} pixels" if row.is_corrected else ""
+        table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(PREFIX), "dim"))
+    return table
+
+
+def _table(title: str, caption: str, columns: Sequence[str]) -> Table:
+    """An empty table whose cells may go over several lines."""
+    table = Table(title=title, caption=caption)
+    table.title_justify = table.caption_justify = "left"
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table

@@ -1,0 +1,508 @@
+"""E-NeRF as a Nerfstudio model: from rays to brightness, from brightness to losses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Dict, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.model_components.losses import interlevel_loss, ray_samples_to_sdist
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
+from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+from tyro.conf import Fixed
+
+from enerf_ns.choices.resolver import FRAME_LOSS_WEIGHT, MEAN_BRIGHTNESS
+from enerf_ns.dataparsers.sensor_estimates.frame_contrast import FAINTEST
+from enerf_ns.evaluation.metrics import psnr, ssim
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
+from enerf_ns.events.batch import FrameBatch, TrainBatch
+from enerf_ns.kernels.hash_grid import backend_of
+from enerf_ns.method.memory import in_parts
+from enerf_ns.rendering.density_voxels import DensityVoxels
+from enerf_ns.rendering.field import EnerfField, HashDensity
+from enerf_ns.rendering.front_to_back import front_to_back
+from enerf_ns.rendering.ray_samplers import (
+    PairedPiecewiseSampler,
+    PairedProposalSampler,
+    PairedUniformSampler,
+    paired_rand,
+)
+from enerf_ns.rendering.seen_volume import SeenVolume
+from enerf_ns.sensor.sensor_model import SensorModelConfig
+from enerf_ns.supervision.balance import ErrorBalance
+from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
+from enerf_ns.supervision.frame_exposure import FrameExposure
+from enerf_ns.supervision.losses import distortion_loss, frame_loss
+
+FAINT = 5e-4
+"""Share of a ray's light that a picture may miss for what lies behind, and as much for what is thin."""
+
+AROUND_DEPTH = 0.05
+"""How far from a ray's depth its light may come from to speak for it, as a share of the depth. Of shares of 2, 5 and
+10 %, this one tells depths that are right within 5 % best from others."""
+
+FAR_SHARE = 0.75
+"""Share of a ray's light that comes from nearer than its far depth."""
+
+
+FARTHEST = 1000.0
+"""Where rays end that go on beyond the box, in scene units: halves of its longest side."""
+
+
+@dataclass
+class EnerfModelConfig(ModelConfig):
+    """E-NeRF. What is None is chosen from the recording when training starts, and stored in config.yml."""
+
+    _target: Type = field(default_factory=lambda: EnerfModel)  # noqa: UP006
+    num_levels: Optional[int] = None  # noqa: UP045
+    """Levels of the hash grid. None: so many that each is at least 1.4 times as fine as the one before, at most 10."""
+    base_res: int = 16
+    """Cells along the box at the coarsest level of the hash grid."""
+    max_res: Optional[int] = None  # noqa: UP045
+    """Cells along the box at the finest level of the hash grid. None: as fine as the sensor's pixels on the scene."""
+    log2_table_size: int = 17
+    """Base-2 logarithm of the entries of each level of the hash grid."""
+    hash_grid: str = "auto"
+    """What computes the hash grid: triton (a GPU), numba (a CPU), torch (any device, slow), or the fastest that fits
+    (auto). Results are the same but for rounding, and so are checkpoints."""
+    hidden_dim: int = 32
+    """Width of the density network."""
+    hidden_dim_colour: Annotated[int, tyro.conf.arg(aliases=["--pipeline.model.hidden-dim-color"])] = 32
+    """Width of the colour network."""
+    num_features: int = 15
+    """Numbers that the density network tells the colour network."""
+    view_direction: Optional[bool] = None  # noqa: UP045
+    """Let brightness depend on the viewing direction, for shiny scenes that are seen from many sides. None: where the
+    camera goes around the scene and a short training shows that it helps."""
+    brightness: Optional[Literal["log-sigmoid", "sigmoid", "exponential"]] = None  # noqa: UP045
+    """What the colour network's output spans evenly: log brightness between limits, brightness as in the paper, or log
+    brightness without an upper limit, for scenes of high dynamic range. None: within limits where the events fit."""
+    num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
+    """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
+    sampling: Optional[Literal["proposal", "uniform"]] = None  # noqa: UP045
+    """Where samples along a ray lie: where a small network expects surfaces, or everywhere. None: where it does."""
+    num_proposal_samples: int = 48
+    """Samples of the proposal network along a ray."""
+    num_samples: int = 24
+    """Samples of the field along a ray."""
+    sensor: Annotated[SensorModelConfig, tyro.conf.arg(name="")] = field(default_factory=SensorModelConfig)
+    event_loss: Optional[str] = None  # noqa: UP045
+    """Compare changes of brightness in units of the threshold, robustly (huber) or squared as in the paper (squared),
+    or up to scale (normalised). None: huber, squared for enerf-paper, or as the preset."""
+    event_loss_weight: float = 1.0
+    """Weight of the event loss."""
+    no_event_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the loss on silent pixels (see datamanager.silent-pairs). None: 0.1, or as the paper for
+    enerf-paper."""
+    no_event_margin: Optional[float] = None  # noqa: UP045
+    """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation. None:
+    0, or as the paper for enerf-paper."""
+    frame_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`ErrorBalance`)."""
+    learn_exposure: Optional[bool] = None  # noqa: UP045
+    """Learn a gain and an offset of each frame. None: beside events, where pixels that saw no event between two frames
+    tell that the exposure changed."""
+    level_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the squared difference between the mean log brightness of a batch and that of mean-brightness. None:
+    0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
+    mean_brightness: Optional[float] = None  # noqa: UP045
+    """Geometric mean of brightness, of what is 1 in a frame that is white, near which a field is held that learns from
+    events alone. None: that of frames of the same camera, or `MEAN_BRIGHTNESS` where there are none."""
+    opacity_loss_weight: Optional[float] = None  # noqa: UP045
+    """Weight of the share of each ray that no surface stops; 0 for an object before nothing. None: 0 where the sensor's
+    border is silent, else 1."""
+    distortion_loss_weight: float = 0.01
+    """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
+    interlevel_loss_weight: float = 1.0
+    """Weight of the loss by which the proposal network learns."""
+    init_density: float = 1.0
+    """Density before training, in 1 / scene unit. A field that starts transparent first draws a negative of the scene,
+    by its holes before the bright background."""
+    contraction: Optional[bool] = None  # noqa: UP045
+    """Contract the space beyond the box towards infinity, as mip-NeRF 360 does; without it nothing lies there. None:
+    where a share of the events comes from beyond the box."""
+    near_plane: Optional[float] = None  # noqa: UP045
+    """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
+
+    # What Nerfstudio's own models have, and this one has no use for, is no flag.
+    enable_collider: Fixed[bool] = True
+    collider_params: Fixed[Optional[Dict[str, float]]] = field(  # noqa: UP006, UP045
+        default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0}
+    )
+    loss_coefficients: Fixed[Dict[str, float]] = field(default_factory=dict)  # noqa: UP006
+    prompt: Fixed[Optional[str]] = None  # noqa: UP045
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Reads config.yml of runs from before the sensor had a config of its own, before contraction, before fields
+        started half opaque, and before the level of brightness could be stated, too."""
+        thresholds = state.pop("contrast_thresholds", None)
+        if "sensor" not in state:
+            state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
+        if "hidden_dim_color" in state:
+            state["hidden_dim_colour"] = state.pop("hidden_dim_color")
+        before = {"contraction": False, "init_density": 0.01, "level_loss_weight": 0.0}
+        before["mean_brightness"] = MEAN_BRIGHTNESS
+        self.__dict__.update({**before, **state})
+
+
+class BoxCollider(AABBBoxCollider):
+    """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
+
+    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that say
+    themselves where they start and end, as those of a crop do, start and end there, within the box. Rays that miss the
+    box, or only graze it, are as good as without length.
+    """
+
+    def forward(self, ray_bundle: RayBundle) -> RayBundle:
+        given = ray_bundle.nears, ray_bundle.fars
+        ray_bundle = self.set_nears_and_fars(ray_bundle)
+        assert ray_bundle.nears is not None and ray_bundle.fars is not None
+        nears, fars = ray_bundle.nears.nan_to_num(0.0, posinf=0.0), ray_bundle.fars.nan_to_num(0.0, 0.0)
+        if given[0] is not None and given[1] is not None:
+            nears, fars = torch.minimum(torch.maximum(nears, given[0]), fars), torch.minimum(fars, given[1])
+        else:
+            nears = nears.clamp(min=self.near_plane)
+        ray_bundle.nears, ray_bundle.fars = nears, torch.maximum(fars, nears + 1e-4)
+        return ray_bundle
+
+
+class Outputs(dict[str, Any]):
+    """What rays show, by name; what is a function is called when it is first asked for, by its name."""
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Any = super().__getitem__(name)
+        if callable(value):
+            self[name] = value = value()
+        return value
+
+
+class EnerfModel(Model):
+    """Hash-grid radiance field whose changes of log brightness explain the events of a camera."""
+
+    config: EnerfModelConfig
+    samples_at_once: int | None = None
+    """Samples that the field is asked at once; None: all (`enerf_ns.method.memory`)."""
+    seen_volume: Callable[[], SeenVolume] | None = None
+    """Where the events that are learnt from came from; None where there are none, as of a model by itself."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        config = self.config
+        assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
+        assert config.contraction is not None
+        assert (
+            config.sampling
+            and config.brightness
+            and config.view_direction is not None
+            and config.opacity_loss_weight is not None
+        )
+        assert config.level_loss_weight is not None and config.mean_brightness is not None
+        assert config.event_loss and config.no_event_loss_weight is not None and config.no_event_margin is not None
+        self.sensor = config.sensor.setup()
+        self.frame_balance = ErrorBalance() if config.frame_loss_weight is None else None
+        self.instant_balance = ErrorBalance()
+        self.exposure = FrameExposure(self.num_train_data) if config.learn_exposure else None
+        self.supervision = EventSupervision(
+            config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
+        )
+        aabb = self.scene_box.aabb
+        if config.contraction:
+            self.collider = NearFarCollider(config.near_plane, FARTHEST, reset_near_plane=False)
+        else:
+            self.collider = BoxCollider(self.scene_box, config.near_plane)
+        self.field = EnerfField(
+            aabb,
+            num_channels=config.num_channels,
+            view_direction=config.view_direction,
+            hidden_dim_colour=config.hidden_dim_colour,
+            brightness=config.brightness,
+            num_features=config.num_features,
+            num_levels=config.num_levels,
+            min_res=config.base_res,
+            max_res=config.max_res,
+            log2_table_size=config.log2_table_size,
+            hidden_dim=config.hidden_dim,
+            contraction=config.contraction,
+            init_density=config.init_density,
+            backend=config.hash_grid,
+        )
+        # a field has its own level, near which it starts: held elsewhere, slider_depth came out 1.3 dB worse
+        self.gain: float = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
+        # what has no upper end shines through anything
+        self._faint = 0.0 if config.brightness == "exponential" else FAINT
+        first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
+        self.proposal = self.expected = None
+        if config.sampling == "proposal":
+            # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
+            # thirtieth (float16) of what their jitter does
+            self.proposal = HashDensity(
+                aabb,
+                num_levels=5,
+                min_res=16,
+                max_res=max(16, config.max_res // 2),
+                log2_table_size=15,
+                hidden_dim=16,
+                contraction=config.contraction,
+                init_density=config.init_density,
+                backend=config.hash_grid,
+            )
+            self.sampler = PairedProposalSampler(
+                config.num_proposal_samples, config.num_samples, first_sampler(single_jitter=True)
+            )
+            self.expected = DensityVoxels(self.proposal)
+        else:
+            self.sampler = first_sampler(num_samples=config.num_samples)
+        self.renderer_rgb = RGBRenderer(background_color="random")
+        self.renderer_accumulation = AccumulationRenderer()
+        self.renderer_depth = DepthRenderer(method="median")
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        groups = {"fields": [*self.field.parameters(), *(self.proposal.parameters() if self.proposal else ())]}
+        if self.exposure is not None:
+            groups["fields"] += self.exposure.parameters()
+        return groups | self.sensor.get_param_groups()
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        if not isinstance(self.sampler, PairedProposalSampler):
+            return []
+        return [
+            TrainingCallback(
+                where_to_run=[TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
+                update_every_num_iters=1,
+                func=self.sampler.step_cb,
+            )
+        ]
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Render rays.
+
+        Args:
+            ray_bundle: Any rays; in training usually a `PairedRayBundle`.
+
+        Returns:
+            rgb (rays, 3), at most `gain` but where brightness is exponential, and accumulation (rays, 1). In training
+            rgb has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in
+            scene units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1] and confidence (rays, 1) of
+            `depth_evidence`, which are computed when they are asked for, by their name.
+        """
+        if ray_bundle.nears is None:
+            ray_bundle = self.collider(ray_bundle)
+        if not self.training:
+            return self._picture(ray_bundle)
+        samples, weights_list, samples_list = self._samples(ray_bundle)
+        field_outputs = in_parts(self.field, samples, self.samples_at_once)
+        weights = samples.get_weights(field_outputs[FieldHeadNames.DENSITY])
+        accumulation = self.renderer_accumulation(weights=weights)
+        background = (1.0 - accumulation) * paired_rand(ray_bundle, 1)
+        rgb = torch.sum(weights * field_outputs[FieldHeadNames.RGB], dim=-2) + background
+        return {
+            "rgb": rgb if self.gain == 1.0 else self.gain * rgb,
+            "accumulation": accumulation,
+            "weights_list": [*weights_list, weights],
+            "ray_samples_list": [*samples_list, samples],
+        }
+
+    def _samples(self, rays: RayBundle) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
+        """Samples along rays, and weights and samples of the proposal network, or of its voxels but in training."""
+        if self.proposal is None:
+            return self.sampler(rays), [], []
+        return self.sampler(rays, density_fns=[self.proposal.density_fn if self.training else self.expected])
+
+    def _picture(self, rays: RayBundle) -> Outputs:
+        """What rays show, from the camera on until hardly any light is left, and the colour only of what it comes
+        from."""
+        grid = self.field.geometry.grid
+        if backend_of(grid.backend, rays.origins, grid.table) == "numba" and not torch.is_grad_enabled():
+            from enerf_ns.rendering.front_to_back_numba import render  # here, since Numba may be missing
+
+            rgb, accumulation, depth = render(rays, self.field, self.sampler, self.expected, self._faint)
+        else:
+            samples, _, _ = self._samples(rays)
+            rgb = rays.origins.new_zeros(len(rays), self.field.num_channels)
+
+            def see(ray: Tensor, weight: Tensor, features: Tensor) -> None:
+                rgb.index_add_(0, ray, weight * self.field.colour(features, rays.directions[ray]))
+
+            weights = front_to_back(samples, self.field.geometry, self._faint, see, self.samples_at_once)
+            accumulation = self.renderer_accumulation(weights=weights)
+            depth = self.renderer_depth(weights=weights, ray_samples=samples)
+        return Outputs(
+            rgb=self.gain * rgb.expand(-1, 3),
+            accumulation=accumulation,
+            depth=depth,
+            normals=lambda: self.normals(rays.origins + rays.directions * depth),
+            confidence=lambda: self.depth_evidence(rays, depth)[0],
+        )
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Outputs:
+        """What the rays of a picture show, each of shape (height, width, its size); normals and confidence where they
+        are asked for, by their name."""
+        outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
+
+        def normals() -> Tensor:
+            points = camera_ray_bundle.origins + camera_ray_bundle.directions * outputs["depth"]
+            chunks = points.reshape(-1, 3).split(self.config.eval_num_rays_per_chunk)
+            found = [self.normals(chunk.to(self.device)).to(points.device) for chunk in chunks]
+            return torch.cat(found).view(points.shape)
+
+        outputs["normals"] = normals
+        outputs["confidence"] = lambda: self.depth_evidence(camera_ray_bundle, outputs["depth"])[0]
+        return outputs
+
+    @torch.no_grad()
+    def depth_evidence(self, rays: RayBundle, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the depth of rays is known, and how far away their surfaces may be where it is not.
+
+        Args:
+            rays: Of any shape.
+            depth: Of the rays, shape (*batch, 1), scene units along the ray.
+
+        Returns:
+            The confidence in the depth, from 0 to 1: the share of a ray's light that comes from within `AROUND_DEPTH`
+            of it, times the evidence of the events that came from there (`SeenVolume.evidence`; beyond the scene box
+            there is none); and the far depth, in scene units along the ray, nearer than which `FAR_SHARE` of the light
+            comes from. Both have the shape of depth, and are on its device.
+        """
+        volume = self.seen_volume() if self.seen_volume else None
+        size, confidence, far = self.config.eval_num_rays_per_chunk, [], []
+        for start in range(0, len(rays), size):
+            chunk = rays.flatten()[start : start + size].to(self.device)
+            middle = depth.reshape(-1, 1)[start : start + size].to(self.device)
+            samples, _, _ = self._samples(self.collider(chunk))
+            weights = front_to_back(samples, self.field.geometry, self._faint, samples_at_once=self.samples_at_once)
+            places = (samples.frustums.starts + samples.frustums.ends) / 2.0
+            share = (weights * ((places - middle[:, None]).abs() <= AROUND_DEPTH * middle[:, None])).sum(dim=1)
+            if volume is not None:
+                share = share * volume.evidence(chunk.origins + chunk.directions * middle)[:, None]
+            stopped = weights.cumsum(dim=1)
+            reached = (stopped >= FAR_SHARE * stopped[:, -1:]).int().argmax(dim=1, keepdim=True)
+            confidence.append(share.clamp(max=1.0))
+            far.append(places.gather(1, reached)[:, 0])
+        return tuple(torch.cat(parts).view(depth.shape).to(depth.device) for parts in (confidence, far))  # type: ignore
+
+    @torch.no_grad()
+    def normals(self, points: Tensor) -> Tensor:
+        """Surface normals at points (rays, 3), mapped to [0, 1]: the direction in which density falls fastest.
+
+        Differences of log density over the corners of a tetrahedron as wide as two cells of the finest level.
+        """
+        assert self.config.max_res is not None
+        corners = points.new_tensor([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]])
+        size = 2.0 * float((self.scene_box.aabb[1] - self.scene_box.aabb[0]).max()) / self.config.max_res
+        density = self.field.geometry.density_fn(points[:, None] + size * corners)
+        gradient = torch.sum(torch.log(density + 1e-6) * corners, dim=1)
+        return 0.5 - 0.5 * torch.nn.functional.normalize(gradient, dim=-1)
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: TrainBatch, metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """All losses, with their weights, of what `get_outputs` made of the rays of a batch."""
+        config = self.config
+        start, end, frames = batch.split(outputs["rgb"])
+        losses: dict[str, Tensor] = {}
+        share: Tensor | float = 1.0  # of the pairs of events, beside those of any instants
+        if batch.events is not None:
+            losses |= self.supervision.losses(start, end, batch.events, self.sensor)
+            if "event_loss" in losses and "instant_loss" in losses:
+                of_events, of_any, number = losses["event_loss"], losses["instant_loss"], batch.events.num_any
+                share = 1.0 / (1.0 + self.instant_balance(of_events, batch.events.num_of_events, of_any, number))
+                losses |= {"event_loss": share * of_events, "instant_loss": (1.0 - share) * of_any}
+            if self.training and self.sensor.threshold_map is not None:
+                self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
+            if self.training and config.level_loss_weight:
+                seen = self.sensor.brightness(torch.cat([start, end]), batch.events.pixels.repeat(2))
+                is_seen = seen > FAINTEST
+                logs = (seen.clamp(min=FAINTEST) / (MEAN_BRIGHTNESS * self.gain)).log()
+                level = (is_seen * logs).sum() / is_seen.count_nonzero().clamp(min=1)
+                losses["level_loss"] = config.level_loss_weight * level.square()
+        if batch.frames is not None:
+            error = self._frame_loss(frames, batch.frames)
+            weight = config.frame_loss_weight
+            if self.frame_balance and batch.events is not None and "event_loss" in losses:
+                of_events = losses["event_loss"].detach() / share / config.event_loss_weight
+                weight = share * self.frame_balance(of_events, batch.events.num_of_events, error, len(frames))
+            losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
+        if self.training:
+            weights, samples = outputs["weights_list"], outputs["ray_samples_list"]
+            if config.opacity_loss_weight:
+                losses["opacity_loss"] = config.opacity_loss_weight * (1.0 - outputs["accumulation"]).mean()
+            if config.distortion_loss_weight:
+                spread = distortion_loss(weights[-1][..., 0], ray_samples_to_sdist(samples[-1]))
+                losses["distortion_loss"] = config.distortion_loss_weight * spread
+            if self.proposal is not None:
+                losses["interlevel_loss"] = config.interlevel_loss_weight * interlevel_loss(weights, samples)
+        return losses
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: TrainBatch) -> dict[str, Tensor]:
+        """event_correlation and frame_psnr (dB), each where the batch has it."""
+        start, end, frames = batch.split(outputs["rgb"])
+        metrics: dict[str, Tensor] = {}
+        if batch.events is not None:
+            metrics |= self.supervision.metrics(start, end, batch.events, self.sensor)
+        if batch.frames is not None:
+            metrics["frame_psnr"] = -10.0 * torch.log10(self._frame_loss(frames, batch.frames))
+        return metrics
+
+    def _frame_loss(self, rendered: Tensor, frames: FrameBatch) -> Tensor:
+        if self.exposure is not None:
+            rendered = self.exposure(rendered, frames.indices[:, 0])
+        return frame_loss(rendered, frames.colours, grey=self.is_grey or frames.are_grey)
+
+    @property
+    def is_grey(self) -> bool:
+        """Whether the field has one channel."""
+        return self.config.num_channels == 1
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once.
+
+        A picture of events has no scores, nor has one that cannot be aligned.
+        """
+        recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
+        scores: dict[str, float] = {}
+        if batch["is_frame"] and rendered.isfinite().all():
+            aligned = align([rendered], [recorded], DEFAULT_PROTOCOL, self.sensor.colour_filter is not None)
+            if aligned.faults == [None]:
+                rendered = aligned.rendered[0].clamp(0.0, 1.0)
+                found = {"psnr": psnr(rendered, recorded), "ssim": ssim(rendered, recorded)}
+                scores = {name: score for name, score in found.items() if not isinstance(score, str)}
+        depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
+        images = {
+            "img": torch.cat([recorded, rendered.nan_to_num()], dim=1),
+            "depth": depth / depth.max().clamp(min=1e-12),
+        }
+        return scores, images
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """What the viewer and ns-render show of a camera: above 1 brightness is white, where it would wrap round."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        outputs["rgb"] = outputs["rgb"].clamp(max=1.0)
+        return outputs
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
+        """Always strict: parameters that do not fit are an error, never a silently random field.
+
+        Checkpoints of earlier versions spell colour_network another way, and have no errors of pairs of any instants.
+        """
+        state_dict = self.instant_balance.state_dict(prefix="instant_balance.") | {
+            name.replace("color_network", "colour_network"): value for name, value in state_dict.items()
+        }
+        return super().load_state_dict(state_dict, strict=True, assign=assign)

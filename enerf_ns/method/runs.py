@@ -1,0 +1,162 @@
+"""Runs of the methods from Python: configure one, train it as `ns-train` does, load it again."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+import torch
+
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+    from nerfstudio.pipelines.base_pipeline import Pipeline
+
+    from enerf_ns.method.pipeline import EnerfPipeline
+    from enerf_ns.method.trainer import EnerfTrainer, EnerfTrainerConfig
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, as it was stored."""
+
+    config_file: Path
+    """config.yml of the run."""
+    config: EnerfTrainerConfig
+    """Config that config.yml holds."""
+    pipeline: EnerfPipeline
+    """Pipeline with the parameters of the last checkpoint."""
+    train_seconds: float | None = None
+    """Time (s) of the training steps; None of a run that was loaded."""
+
+
+def method_config(
+    name: str, data: Path, output_dir: Path, changes: Mapping[str, Any] = MappingProxyType({})
+) -> EnerfTrainerConfig:
+    """The configuration of a method, to train without a viewer.
+
+    Args:
+        name: Of the method, such as `enerf`.
+        data: Folder of a recording.
+        output_dir: Where runs go, each into a folder of its own.
+        changes: Values by the names of ns-train's flags, such as {"pipeline.datamanager.event_pairs": 512}.
+
+    Raises:
+        FlagError: No method, or no setting, has such a name.
+    """
+    from nerfstudio.configs.method_configs import all_methods
+
+    own = [method for method, known in all_methods.items() if isinstance(known, type(all_methods["enerf"]))]
+    if name not in own:
+        raise FlagError(f"There is no method {name} in this package; choose one of {', '.join(own)}.")
+    config = cast("EnerfTrainerConfig", copy.deepcopy(all_methods[name]))
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir, config.vis = output_dir, "tensorboard"
+    for path, value in changes.items():
+        *parents, attribute = path.split(".")
+        owner: Any = config
+        for parent in parents:
+            owner = getattr(owner, parent, None)
+        if not hasattr(owner, attribute):
+            raise FlagError(f"The method {name} has no setting {path}; ns-train {name} --help lists all that it has.")
+        setattr(owner, attribute, value)
+    return config
+
+
+def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:
+    """A trainer as `ns-train` makes it: random numbers seeded by `config.machine.seed`, everything set up.
+
+    What Nerfstudio logs goes to this run from now on, and to none before it in this process.
+    """
+    from nerfstudio.utils import writer
+
+    random.seed(config.machine.seed)
+    np.random.seed(config.machine.seed)  # noqa: NPY002 - libraries draw from it
+    torch.manual_seed(config.machine.seed)
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    trainer: EnerfTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def train(config: EnerfTrainerConfig) -> Run:
+    """Train in this process with all that `ns-train` does, and load what was stored.
+
+    Args:
+        config: Of the run; its time stamp, which names the run's folder, is set unless it is set already.
+
+    Raises:
+        RecordingError: The recording cannot be used; nothing is written then.
+        FlagError: A setting cannot be followed; nothing is written then.
+    """
+    from nerfstudio.utils import profiler
+
+    config.resolved()
+    config.set_timestamp()
+    config.save_config()
+    trainer = set_up(config)
+    try:
+        trainer.train()
+    finally:
+        profiler.flush_profiler(config.logging)
+    run = load(config.get_base_dir() / "config.yml")
+    return replace(run, train_seconds=trainer.error_against_time.seconds)
+
+
+def load(config_file: Path) -> Run:
+    """A trained run of one of this package's methods, to evaluate it.
+
+    Args:
+        config_file: config.yml of the run.
+
+    Raises:
+        RecordingError: The file is missing, cannot be loaded, or is of a method of another package.
+    """
+    from nerfstudio.configs.method_configs import all_methods
+
+    config, pipeline = load_any_method(config_file, "test")
+    if not isinstance(config, type(all_methods["enerf"])):
+        raise RecordingError(
+            f"{config_file} is a run of the method {config.method_name}; give the config.yml of a run of enerf."
+        )
+    return Run(config_file, cast("EnerfTrainerConfig", config), cast("EnerfPipeline", pipeline))
+
+
+def load_any_method(
+    config_file: Path, test_mode: Literal["test", "val", "inference"]
+) -> tuple[TrainerConfig, Pipeline]:
+    """A trained run of any of Nerfstudio's methods.
+
+    Args:
+        config_file: config.yml of the run.
+        test_mode: What of the data is loaded, as of Nerfstudio's `eval_setup`.
+
+    Raises:
+        RecordingError: The file is missing or cannot be loaded.
+    """
+    if not config_file.is_file():
+        found = "is a folder" if config_file.is_dir() else "does not exist"
+        raise RecordingError(f"{config_file} {found}; give the config.yml of a trained run.")
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    from enerf_ns.terminal import without_chatter
+
+    try:
+        with without_chatter():
+            return eval_setup(config_file, test_mode=test_mode)[:2]
+    except (Exception, SystemExit) as error:  # whatever of a run is missing or of another version
+        reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
+        if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):
+            reason = "its checkpoints are not found"  # the folder is empty or missing, which Nerfstudio only prints
+        raise RecordingError(
+            f"{config_file} cannot be loaded as a trained run ({reason}); give the config.yml that training wrote, in "
+            "the folder in which training was started."
+        ) from error

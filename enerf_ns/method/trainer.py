@@ -1,0 +1,601 @@
+"""Training as a person sees it: what the recording holds at the start, where everything lies at the end, and what
+becomes of a run that is interrupted, or whose steps go wrong."""
+
+from __future__ import annotations
+
+import json
+import signal
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryFile
+from types import FrameType
+from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+
+import torch
+import yaml
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.comms import is_main_process
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer import Viewer
+from rich.text import Text
+from torch import Tensor
+from tyro.conf import Fixed
+
+from enerf_ns.choices.ranges import check_ranges
+from enerf_ns.choices.resolver import resolve
+from enerf_ns.choices.table import choices_table, findings_table, recording_table
+from enerf_ns.dataparsers.formats.registry import check_outside_recordings
+from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.errors import (
+    FlagError,
+    OutputError,
+    RecordingError,
+    exit_with_a_sentence,
+    printable,
+    quoted,
+)
+from enerf_ns.dataparsers.recording.files import absolute, write_together, write_whole
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.kernels.hash_grid import fitting
+from enerf_ns.kernels.threads import kernels_alone
+from enerf_ns.method.checkpoints import (
+    checkpoint_path,
+    is_whole,
+    load_checkpoint,
+    newest_checkpoint,
+    random_state,
+    read_config,
+    set_random_state,
+    write_checkpoint,
+)
+from enerf_ns.method.error_against_time import ErrorAgainstTime
+from enerf_ns.method.guarded_steps import (
+    LEARNING_CHECKED_EVERY,
+    LEARNING_CHECKED_FROM,
+    MOST_SKIPPED,
+    GuardedOptimizers,
+    Later,
+    keep_batch,
+    what_is_not_finite,
+    why_nothing_is_learnt,
+)
+from enerf_ns.method.model import EnerfModel
+from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
+from enerf_ns.method.probe import view_direction_gain
+from enerf_ns.method.throughput import batch_factor
+from enerf_ns.poses.findings import findings
+from enerf_ns.quiet import silence_known_warnings
+from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
+
+SAMPLER_COUNTERS = ("_step", "_steps_since_update")
+"""What Nerfstudio's proposal sampler remembers from step to step."""
+
+POSES_FILE = "poses.json"
+"""What was found to be wrong with clock, poses and lens, in the folder of a run."""
+
+LONG = 3600.0
+"""Seconds of training beyond which it is said beforehand how long it takes."""
+
+
+@dataclass
+class EnerfTrainerConfig(TrainerConfig):
+    """Nerfstudio's trainer; reads and checks the recording before anything is written."""
+
+    _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
+    pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
+    prompt: Fixed[Optional[str]] = None  # noqa: UP045
+    preset: Optional[str] = None  # noqa: UP045
+    """The selections of the E-NeRF paper for one of its sequences; flags that are set stand. One of eds00, eds11,
+    mocap-1d-trans, mocap-desk2, mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse,
+    spiral1-more-sparse, spiral2."""
+
+    evaluation_share: float = 0.03
+    """Share of the training time that may go into evaluation meanwhile: scores of a few held-out frames and of held-out
+    events at moments evenly spaced in log time (history.jsonl), and previews. All held-out frames are scored once more
+    at the end, on top of that. 0: nothing is evaluated, at the end neither."""
+
+    def __post_init__(self) -> None:
+        """Looks at the config.yml that a flag names, since Nerfstudio reads it itself, with a traceback."""
+        if self.load_config is not None:
+            with exit_with_a_sentence():
+                read_config(absolute(self.load_config))
+
+    def resolved(self) -> EnerfTrainerConfig:
+        """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
+        recording (`pipeline.resolution`), whose events are read and checked.
+
+        Raises:
+            RecordingError: The recording cannot be used, or the checkpoint to go on from.
+            FlagError: A setting cannot be followed.
+            OutputError: The run's folder holds another run.
+        """
+        check_ranges(self)
+        self._check_device()
+        config = deepcopy(self)
+        pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
+        data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
+        if data is None:
+            raise FlagError("--data is missing; give the folder of a recording")
+        config.data = pipeline.datamanager.data = parser.data = absolute(data)
+        config.output_dir = absolute(self.output_dir)
+        config._check_output_dir()
+        config.load_dir = self.load_dir and absolute(self.load_dir)
+        config.load_checkpoint = self.load_checkpoint and absolute(self.load_checkpoint)
+        checkpoint = config.checkpoint()
+        decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
+        for name, group in config.optimizers.items():
+            scheduler = group["scheduler"]
+            scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
+        if not pipeline.resolution.choices:
+            recording = parser.setup().recording()
+            optimizer, device = config.optimizers["fields"]["optimizer"], config.machine.device_type
+            pipeline.resolution = resolve(
+                pipeline,
+                recording,
+                self.preset,
+                lambda filled: view_direction_gain(filled, optimizer, device),
+                lambda filled: batch_factor(filled, device),
+            )
+        if checkpoint:
+            config._check_fits(checkpoint)
+        index_events(config.recording())
+        return config
+
+    def _check_output_dir(self) -> None:
+        """Refuses a place where no folder of a run can be, before anything that takes time.
+
+        Raises:
+            OutputError: It is the one that is set.
+        """
+        check_outside_recordings("--output-dir", self.get_base_dir())
+        there = next(folder for folder in (self.output_dir, *self.output_dir.parents) if folder.exists())
+        try:
+            with TemporaryFile(dir=there):
+                pass
+        except OSError as error:
+            raise _unwritable(self.output_dir, error) from error
+
+    def _check_device(self) -> None:
+        """Refuses a device, or a backend of the hash grid, that is not there.
+
+        Raises:
+            FlagError: It is the one that is set.
+        """
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise FlagError("--machine.device-type is cuda, but no GPU can be used; check its driver, or give cpu.")
+        name = self.pipeline.model.hash_grid
+        if name not in ("auto", "torch"):
+            positions = torch.empty(0, 3, device=self.machine.device_type)
+            try:
+                fitting(name, positions, positions[:, :2])
+            except ValueError as error:
+                raise FlagError(f"--pipeline.model.hash-grid: {error}.") from error
+
+    def _check_fits(self, checkpoint: Path) -> None:
+        """Refuses a checkpoint of another field, sensor or box of the scene than those of this config, when resolved.
+
+        Raises:
+            FlagError: It is such a one.
+        """
+        filled = self.pipeline.resolution.applied_to(self.pipeline)
+        parser = filled.datamanager.dataparser.setup()
+        box = parser.outputs(parser.recording(), "train").scene_box
+        with torch.random.fork_rng():
+            model: EnerfModel = filled.model.setup(scene_box=box, num_train_data=0)
+        state = load_checkpoint(checkpoint)
+        stored = {
+            name.replace("_model.module.", "_model."): value
+            for name, value in state["pipeline"].items()
+            if name.startswith("_model.")
+        }
+        here = model.state_dict(prefix="_model.")
+        shapes = [
+            [name, *(tuple(side[name].shape) if name in side else "missing" for side in (stored, here))]
+            for name in (*here, *stored)
+        ]
+        other = [f"{name.removeprefix('_model.')} is {there}, but {mine} here" for name, there, mine in shapes
+                 if there != mine]  # fmt: skip
+        other += [f"{name} is learned" for name in state["optimizers"].keys() - model.get_param_groups().keys()]
+        if not other and not torch.allclose(*(side["_model.field.geometry.aabb"] for side in (stored, here))):
+            other = ["its scene has another box"]
+        if other:
+            raise FlagError(
+                f"The checkpoint {checkpoint} is of another configuration ({other[0]}); give the flags of its run, "
+                "which its config.yml states, or continue that run with --load-config."
+            )
+
+    def recording(self) -> EventRecording:
+        """The recording that is learnt from, of a config that is resolved."""
+        return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
+
+    def checkpoint(self) -> Path | None:
+        """The checkpoint that training goes on from: the newest whole one of a run that config.yml was loaded of, else
+        what the flags name, else None.
+
+        Raises:
+            RecordingError: There are checkpoints, and none is whole.
+            FlagError: A checkpoint that a flag names is not there, or the run is to end before it.
+            OutputError: The run's folder holds a run already that neither config.yml nor a flag names.
+        """
+        folder = super().get_checkpoint_dir()
+        own = newest_checkpoint(folder)
+        if own and self.pipeline.resolution.choices:
+            return own
+        if own and self.load_dir != folder:
+            raise OutputError(
+                f"{folder.parent} holds a run already; continue it with --load-config "
+                f"{quoted(folder.parent / 'config.yml')}, or give the new one another --timestamp."
+            )
+        if self.load_dir and self.load_step is None:
+            try:
+                path = newest_checkpoint(self.load_dir)
+                found = "is no folder" if self.load_dir.exists() else "does not exist"
+            except RecordingError:
+                path, found = None, "holds no whole checkpoint"
+            if path is None:
+                raise FlagError(f"--load-dir {self.load_dir} {found}; give nerfstudio_models of a trained run.")
+        elif self.load_dir or self.load_checkpoint:
+            path = checkpoint_path(self.load_dir, self.load_step or 0) if self.load_dir else self.load_checkpoint
+            assert path is not None
+            if not is_whole(path):
+                found = "is cut short, damaged or none" if path.exists() else "does not exist"
+                raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
+        else:
+            return None
+        step = load_checkpoint(path)["step"]
+        if step + 1 >= self.max_num_iterations:
+            raise FlagError(
+                f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give more "
+                "to train on."
+            )
+        return path
+
+    def get_checkpoint_dir(self) -> Path:
+        """The folder of the run's checkpoints; `load_step` becomes that of the newest whole one in it.
+
+        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they
+        load `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which
+        they can be told better.
+
+        Raises:
+            SystemExit: The folder is there, but no whole checkpoint in it; with one sentence.
+        """
+        folder = super().get_checkpoint_dir()
+        with exit_with_a_sentence():
+            newest = newest_checkpoint(folder)
+        if newest is not None:
+            self.load_step = int(newest.stem.removeprefix("step-"))
+        return folder
+
+    def print_to_terminal(self) -> None:
+        """Prints nothing: what is chosen is a table, and all settings are in config.yml."""
+
+    def save_config(self) -> None:
+        """Show what the recording holds and what is made of it, then store both with the run."""
+        with exit_with_a_sentence():
+            config = self.resolved()
+            resolution = config.pipeline.resolution
+            CONSOLE.print(recording_table(resolution.applied_to(config.pipeline).datamanager.dataparser))
+            for line in resolution.selection:
+                CONSOLE.print(Text(f"* {printable(line)}"))
+            CONSOLE.print(choices_table(resolution.choices))
+            folder = config.get_base_dir()
+            choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
+            try:
+                write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
+            except OSError as error:
+                raise _unwritable(folder, error) from error
+            say_where("configuration", quoted(folder / "config.yml"))
+
+    def setup(self, **kwargs: Any) -> EnerfTrainer:
+        """The trainer, of what this config comes to on its recording."""
+        with exit_with_a_sentence():
+            silence_known_warnings()
+            config = self.resolved()
+            config.load_checkpoint, config.load_dir = config.checkpoint(), None
+            with without_chatter():
+                return self._target(config, **kwargs)
+
+
+def _unwritable(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"{folder} could not be written to ({error.strerror}); make room, or give another --output-dir.")
+
+
+class EnerfTrainer(Trainer):
+    """Nerfstudio's trainer, which survives: an interruption, a full disk, a step that is not finite.
+
+    A step whose losses or gradients are not finite changes neither parameters nor the state of the optimisers; the
+    learning rate goes on with the number of the step.
+    """
+
+    config: EnerfTrainerConfig
+    pipeline: EnerfPipeline
+    optimizers: GuardedOptimizers
+
+    def __init__(self, config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1):
+        super().__init__(config, local_rank, world_size)
+        self.num_skipped = 0
+        """Steps that were left out because they were not finite."""
+        self._skipped_in_a_row = 0
+        self._unseen: Later[tuple[int, TrainStep]] | None = None  # the last step
+        self._trained = -1  # the last step that was
+        self._interrupted = False
+        self._recorded: dict[str, Any] | None = None  # of the time before the checkpoint
+        self._unsaved = ""  # why the last checkpoint could not be stored
+        self._found_wrong: set[str] = set()
+        self._handlers: dict[int, Any] = {}
+
+    @exit_with_a_sentence()
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        config = self.config
+        data, config.data = config.data, None  # so that the viewer keeps camera paths with the run
+        try:
+            with without_chatter():
+                super().setup(test_mode)
+        finally:
+            config.data = data
+        self.pipeline.num_steps = config.max_num_iterations
+        self.error_against_time = ErrorAgainstTime(
+            self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
+        )
+        if is_main_process():  # of those that train together, one tells of it
+            self._say_how_long()
+            self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
+        if isinstance(self.viewer_state, Viewer):
+            CONSOLE.print(*self.viewer_state.viewer_info, sep="\n", soft_wrap=True, highlight=False, style="green")
+        elif self.viewer_state is not None:
+            CONSOLE.print(f"Legacy viewer at: {self.viewer_state.viewer_url}", soft_wrap=True, style="green")
+
+    def _say_how_long(self) -> None:
+        """Says how long training will take, where that is long."""
+        steps = self.config.max_num_iterations - self._start_step
+        seconds = steps * (self.pipeline.seconds_a_step or 0.0)
+        if seconds > LONG:
+            say(
+                f"{steps} steps of {self.pipeline.datamanager.get_train_rays_per_batch()} rays take about "
+                f"{duration(seconds)} on the {self.device}: enerf takes minutes; this is for a GPU."
+            )
+
+    def _check_viewer_warnings(self) -> None:
+        """Nothing: evaluation runs under every `--vis`."""
+
+    def setup_optimizers(self) -> GuardedOptimizers:
+        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        if self.config.load_checkpoint is None:
+            return
+        state = load_checkpoint(self.config.load_checkpoint)
+        if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
+            set_random_state(state["generators"], self.pipeline.device)
+            self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
+        vars(self.pipeline.model.sampler).update(state.get("sampler", {}))
+        self._recorded = state.get("error_against_time")
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Stores the run as it is after a step, whole or not at all; where the disk is full, the checkpoints that are
+        there stay, which is said, and training goes on."""
+        pipeline = self.pipeline
+        state = {
+            "step": step,
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+            "max_steps": {name: group["scheduler"].max_steps for name, group in self.config.optimizers.items()},
+            "device": pipeline.device.type,
+            "generators": {
+                **random_state(pipeline.device),
+                "batches": pipeline.datamanager.generator.get_state(),
+            },
+            "sampler": {
+                name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
+            },
+            "error_against_time": self.error_against_time.state(),
+        }
+        path = checkpoint_path(self.checkpoint_dir, step)
+        try:
+            write_checkpoint(path, state)
+        except OSError as error:
+            self._unsaved = f"Step {step} could not be stored in {self.checkpoint_dir} ({error.strerror or error})"
+            say(f"{self._unsaved}; the checkpoints before it stay. Make room.")
+            return
+        self._unsaved = ""
+        if self.config.save_only_latest_checkpoint and not self._skipped_in_a_row:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink()
+
+    @exit_with_a_sentence()
+    def train(self) -> None:
+        """Trains up to step `max_num_iterations` in total; interrupted by SIGINT or SIGTERM, stores a checkpoint first.
+
+        Raises:
+            SystemExit: With code 130, training was interrupted; with a sentence, it was given up, since steps in a row
+                were not finite, the last checkpoint could not be stored, or something else went wrong that the user can
+                mend.
+        """
+        config, total = self.config, self.config.max_num_iterations
+        self._trained = self._start_step - 1
+        if self._start_step >= total:
+            say(f"The run in {self.base_dir} is at its end, at step {total} of {total}.")
+            return
+        self._handle_signals()
+        config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
+        try:
+            if is_main_process():
+                self.error_against_time.begin(self._start_step, self._recorded)
+            super().train()
+        except OSError as error:  # of what Nerfstudio writes beside checkpoints, such as TensorBoard's files
+            raise SystemExit(
+                f"enerf: Training ended at step {self._trained}, since {self.base_dir} could not be written to "
+                f"({error.strerror or error}); the checkpoints there stay. Make room, and continue with ns-train "
+                f"{config.method_name} --load-config {quoted(self.base_dir / 'config.yml')}."
+            ) from error
+        finally:
+            config.max_num_iterations = total
+            self._restore_signals()
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        with self.error_against_time.step(step), kernels_alone():
+            results = super().train_iteration(step)
+        self._metrics = results[2]
+        self._trained = step
+        self._look_at_finite(step)
+        if step >= LEARNING_CHECKED_FROM and step % LEARNING_CHECKED_EVERY == 0:
+            self._look_at_learning(step)
+        if self._interrupted:
+            self.stop_training = True
+        return results
+
+    def eval_iteration(self, step: int) -> None:
+        if not self.stop_training and is_main_process():
+            self.error_against_time.after_step(step, self._metrics)
+        super().eval_iteration(step)
+
+    def _look_at_finite(self, step: int) -> None:
+        """Counts steps that were left out; on a GPU the one before this, which it knows by now."""
+        assert self.optimizers.finite is not None
+        latest = Later((step, self.pipeline.last_step), self.optimizers.finite)
+        known = self._unseen if self.optimizers.finite.is_cuda else latest
+        self._unseen = latest
+        if known is not None and not known:
+            self._look_at_skipped(*known.seen)
+        elif known is not None:
+            self._skipped_in_a_row = 0
+
+    def _finish(self, step: int) -> None:
+        """Scores the run at its end, whose checkpoint is stored by then; an interruption stops that at once."""
+        self._restore_signals()
+        with self.train_lock:
+            self.error_against_time.finish()
+        writer.write_out_storage()
+        for log in writer.EVENT_WRITERS:
+            if isinstance(log, writer.TensorboardWriter):
+                log.tb_writer.flush()
+
+    def _is_finite(self) -> Tensor:
+        """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
+
+        Where mixed precision scales the loss, gradients that overflow are the scaler's, who leaves them out.
+        """
+        self.pipeline.stopwatch.lap("backward")
+        numbers = list(self.pipeline.last_step.losses.values())
+        if not self.grad_scaler.is_enabled() or self.grad_scaler.get_scale() <= 1:
+            numbers += [
+                torch.linalg.vector_norm(parameter.grad)
+                for parameter in self.pipeline.parameters()
+                if parameter.grad is not None
+            ]
+        return torch.stack([number.float() for number in numbers]).isfinite().all()
+
+    def _look_at_skipped(self, step: int, seen: TrainStep) -> None:
+        """Counts a step that was left out, keeps the batch of the first, and gives up after some in a row."""
+        term = what_is_not_finite(seen, self.pipeline.model)
+        self.optimizers.zero_grad_all()  # of which some may be gathered over several steps
+        self.num_skipped += 1
+        self._skipped_in_a_row += 1
+        if self.num_skipped == 1 and is_main_process():
+            file = self.base_dir / f"skipped-step-{step:09d}.pt"
+            try:
+                keep_batch(seen, step, file)
+            except OSError as error:
+                file = f"not kept ({error.strerror})"
+            say(f"Step {step} is left out, since {term} is not finite; its batch is {file}.")
+        if self._skipped_in_a_row == MOST_SKIPPED:
+            raise SystemExit(
+                f"enerf: Training stopped at step {step}, since {term} is not finite, {MOST_SKIPPED} steps in a row; "
+                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
+                "recording."
+            )
+
+    def _look_at_learning(self, step: int) -> None:
+        """Says, once for each reason, that what is rendered is nothing."""
+        found = why_nothing_is_learnt(self.pipeline.last_step, self.pipeline.model.sensor)
+        for reason in found.keys() - self._found_wrong:
+            self._found_wrong.add(reason)
+            say(
+                f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
+                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and "
+                "clock with `enerf inspect`."
+            )
+
+    def _handle_signals(self) -> None:
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) != signal.SIG_IGN:  # as of a run in the background, which nobody interrupts
+                    self._handlers[number] = signal.signal(number, self._interrupt) or signal.SIG_DFL
+        except ValueError:  # not in the main thread, to which alone signals come
+            pass
+
+    def _restore_signals(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._interrupted:
+            raise SystemExit(130)
+        self._interrupted = self.stop_training = True
+        say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
+
+    def _train_complete_viewer(self) -> None:
+        self._restore_signals()
+        with suppress(KeyboardInterrupt):  # until which the viewer runs
+            super()._train_complete_viewer()
+
+    def _after_train(self) -> None:
+        self.step = self._trained  # where training was stopped, Nerfstudio has counted one further
+        config = quoted(self.base_dir / "config.yml")
+        if self._trained + 1 < self._start_step + self.config.max_num_iterations:
+            if self._trained >= self._start_step:
+                self.save_checkpoint(self._trained)
+            writer.write_out_storage()
+            clear_line()
+            self._say_skipped()
+            say_where("continue", f"ns-train {self.config.method_name} --load-config {config}")
+            raise SystemExit(130)
+        with without_chatter():
+            super()._after_train()
+        if self._unsaved:
+            raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and train on.")
+        CONSOLE.rule("Training is done")
+        self._say_skipped()
+        learned = self.pipeline.model.sensor.learned()
+        if learned:
+            numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
+            say(f"The sensor as it was learned: {numbers}.")
+        self._say_poses()
+        for what, where in {
+            "checkpoint": quoted(self.checkpoint_dir),
+            "scores, picture and video": f"enerf report {config}",
+            "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
+            "video of your own": f"ns-render interpolate --load-config {config} --output-path video.mp4",
+            "look around": f"ns-viewer --load-config {config}",
+        }.items():
+            say_where(what, where)
+
+    def _say_poses(self) -> None:
+        """Shows what of clock, poses and lens was found to be wrong, and stores it with the run."""
+        refiner, manager = self.pipeline.poses, self.pipeline.datamanager
+        if refiner is None or not refiner.looks:
+            return
+        found = findings(refiner, manager.distance)
+        CONSOLE.print(findings_table(found))
+        try:
+            write_whole(self.base_dir / POSES_FILE, json.dumps([row.as_dict() for row in found], indent=2) + "\n")
+        except OSError as error:
+            say(f"{self.base_dir / POSES_FILE} could not be written ({error.strerror}); make room.")
+        if refiner.corrected:
+            say_where("poses as refined", f"enerf export poses {quoted(self.base_dir / 'config.yml')}")
+
+    def _say_skipped(self) -> None:
+        if self.num_skipped:
+            say(f"{self.num_skipped} steps were left out, since they were not finite.")

@@ -1,0 +1,344 @@
+"""The viewer on a recording: where it opens, the recorded trajectory to play along, and what is drawn over renders."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import torch
+import viser
+import viser.transforms as vtf
+from jaxtyping import Float64
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer.render_state_machine import RenderAction
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer.viewer_elements import ViewerControl
+from torch import Tensor
+
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.datamanager import EnerfDataManager
+from enerf_ns.method.model import EnerfModel, Outputs
+from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events
+from enerf_ns.method.viewer.seen_rays import SeenRays
+from enerf_ns.method.viewer.view_renderer import ViewRenderer
+
+LOOK_WIDTH = 64
+"""Pixels of the picture from which the depth before the first view is measured."""
+
+BEHIND = 0.2
+"""Distance of the first view behind its training camera, as a share of the depth of the scene before that."""
+
+FRUSTUM = 0.006
+"""Scale of a camera that is drawn, as a share of the same depth; it is then drawn about three times as wide."""
+
+MOST_CAMERAS = 16
+"""Training cameras that are drawn."""
+
+FULL_WIDTH = 640
+"""Longer side, in pixels, of the picture of a view that rests; "Max res" in the viewer."""
+
+MIDDLE_BRIGHTNESS = 0.4
+"""What the median of the first view is shown as, where events alone were learnt from."""
+
+PATH_POINTS = 200
+"""Points of the trajectory that is drawn."""
+
+PLAY_SECONDS = 10.0
+"""What playing takes at least; longer recordings play as fast as they were recorded."""
+
+PLAY_STEP = 0.125
+"""Seconds from one view that is played to the next."""
+
+FIRST_SEEN, SEEN_EVERY = 500, 1.5
+"""Step of a training that is watched after which it is known what was seen, and factor from one such step to the
+next."""
+
+LOOKED_EVERY = 1.1
+"""Factor from one step of a training that is watched, at which it is looked how bright the field is, to the next."""
+
+ACCENT = (255, 211, 105)
+"""Colour of the trajectory and the sensor."""
+
+STATED = (150, 150, 150)
+"""Colour of the trajectory as it was stated, where it was corrected."""
+
+
+class SceneView(ViewerControl):
+    """Makes a viewer of Nerfstudio's one on a recording, when it starts (`_setup`).
+
+    Args:
+        model: That the viewer shows.
+        manager: Of what it learns from.
+    """
+
+    def __init__(self, model: EnerfModel, manager: EnerfDataManager):
+        self._model, self._manager = model, manager
+        self._seen: SeenRays | None = None
+        self._seen_at = self._looked_at = 0  # training steps
+        self._level = 0.0  # stops
+        self._moves = threading.Lock()
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        outputs = self._manager.train_dataparser_outputs
+        self._transform, self._scale = outputs.metadata["transform"].numpy(), outputs.dataparser_scale
+        self._camera = self._recording.camera.undistorted()
+        self._look_from_the_middle()
+        if viewer.trainer is None:
+            self._seen = self._seen_now()
+        self._tidy_up()
+        self._draw_recording()
+        self._add_panel()
+        self.viser_server.on_client_connect(self._open)
+
+    @property
+    def _recording(self) -> EventRecording:
+        """With the poses as they are corrected by now."""
+        return self._manager.recording
+
+    def _look_from_the_middle(self) -> None:
+        """Finds the first view: what lies before the camera that is the middle one in time, and at which depth."""
+        dataset, model = self._manager.train_dataset, self._model
+        self._middle = int(np.argsort(dataset.frames.times)[len(dataset) // 2])
+        camera = dataset.cameras[self._middle : self._middle + 1].to(model.device)
+        camera.rescale_output_resolution(LOOK_WIDTH / float(camera.width))
+        self._look_camera = camera
+        self._look()  # the first may compile
+        begin = time.perf_counter()
+        depth = self._look()
+        self._rays_per_second = depth.numel() / (time.perf_counter() - begin)
+        self._depth = float(depth.median())
+        self._up = dataset.cameras.camera_to_worlds[:, :3, 1].double().mean(dim=0).numpy()
+
+    def _look(self) -> Tensor:
+        """Depth of the first view as the field is now, scene units; notes how bright that view is."""
+        model, was_training = self._model, self._model.training
+        outputs = model.eval().get_outputs_for_camera(self._look_camera)
+        model.train(was_training)
+        if self._manager.config.supervision == "events":  # which leave the level of brightness open
+            self._level = float(np.log2(MIDDLE_BRIGHTNESS / outputs["rgb"].median().clamp(min=1e-6).cpu()))
+        return outputs["depth"]
+
+    def _tidy_up(self) -> None:
+        """Sizes that suit the scene, where none are set; and nothing to press that changes nothing."""
+        viewer, panel, defaults = self.viewer, self.viewer.control_panel, ViewerConfig()
+        if viewer.config.camera_frustum_scale == defaults.camera_frustum_scale:
+            viewer.config.camera_frustum_scale = FRUSTUM * self._depth * VISER_NERFSTUDIO_SCALE_RATIO
+        if viewer.config.max_num_display_images == defaults.max_num_display_images:
+            viewer.config.max_num_display_images = MOST_CAMERAS
+        panel._max_res.value = FULL_WIDTH
+        panel._crop_handle.visible = False  # until a crop is enabled
+        panel._train_speed.set_hidden(True)  # these set max res, and what nothing reads
+        panel._train_util.set_hidden(True)
+        if viewer.trainer is None:
+            viewer.pause_train.visible = viewer.resume_train.visible = False
+
+    def _draw_recording(self) -> None:
+        """The trajectory, and the sensor on it."""
+        self._drawn = [
+            self.viser_server.scene.add_frame("/cameras", show_axes=False),
+            self.viser_server.scene.add_frame("/recording", show_axes=False),
+        ]
+        self._draw_path()
+        self._sensor = self.viser_server.scene.add_camera_frustum(
+            "/recording/sensor",
+            fov=2.0 * np.arctan(0.5 * self._camera.height / self._camera.fy),
+            aspect=self._camera.width / self._camera.height,
+            scale=self.viewer.config.camera_frustum_scale,
+            color=ACCENT,
+        )
+
+    def _draw_path(self) -> None:
+        """The trajectory as it is corrected by now, and in grey as it was stated, where that is another one."""
+        recording, self._path_of = self._recording, self._manager.corrections
+        times = recording.instants(PATH_POINTS)
+        self._path = np.stack([self._pose(int(t))[:, 3] for t in times])
+        lines: dict[str, tuple[np.ndarray, tuple[int, int, int]]] = {"path": (self._path, ACCENT)}
+        if recording.as_read is not None:
+            stated = recording.as_read.trajectory
+            lines["stated"] = np.stack([self._pose(int(t), stated)[:, 3] for t in times]), STATED
+        for name, (points, colour) in lines.items():
+            self.viser_server.scene.add_spline_catmull_rom(
+                f"/recording/{name}",
+                points * VISER_NERFSTUDIO_SCALE_RATIO,
+                color=colour,
+                line_width=2.0,
+                segments=PATH_POINTS,
+            )
+
+    def _add_panel(self) -> None:
+        gui, (first, last) = self.viser_server.gui, np.array(self._recording.span) * 1e-9
+        step = 10.0 ** np.floor(np.log10((last - first) / 500.0))
+        begin = step * round(self._manager.train_dataset.frames.times[self._middle] * 1e-9 / step)
+        with gui.add_folder("Recording", order=self.viewer.stats_markdown.order + 0.5):
+            self._time = gui.add_slider("Time (s)", first, last, step, begin, hint="A moment of the recording")
+            self._plays = gui.add_checkbox("Play", False, hint="Move along the trajectory, over and over")
+            self._follows = gui.add_checkbox("Follow", True, hint="Look from where the sensor was at that moment")
+            self._events = gui.add_checkbox("Events", False, hint="Of the sensor at that moment, on what it saw")
+            self._window = gui.add_slider("Last (ms)", 1, 100, 1, 10, hint="Events up to so long before are drawn")
+            self._stops = gui.add_slider("Brightness", -4.0, 4.0, 0.1, 0.0, hint="Stops; each doubles the brightness")
+            self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
+            self._depths = gui.add_markdown("")
+            self._corrected = gui.add_markdown(self._corrections_in_words)
+        for handle in (self._events, self._window, self._stops, self._gamma):
+            handle.on_update(lambda _: self.viewer._trigger_rerender())
+        self._time.on_update(lambda _: self._move())
+        self._follows.on_update(lambda _: self._move())
+        self._plays.on_update(lambda _: threading.Thread(target=self._play, daemon=True).start())
+        self._move()
+
+    def _open(self, client: viser.ClientHandle) -> None:
+        """Shows a browser the first view, and renders for it from now on."""
+        own = self.viewer.render_statemachines[client.client_id]
+        own.running = False
+        own.render_trigger.set()  # so that it ends before it has rendered anything
+        renderer = ViewRenderer(self.viewer, client, self._rays_per_second, self._limit, self._shown)
+        self.viewer.render_statemachines[client.client_id] = renderer
+        pose = self._manager.train_dataset.cameras.camera_to_worlds[self._middle].cpu().double().numpy()
+        back = pose[:, 2]
+        self._turn(client, pose[:, 3] + BEHIND * self._depth * back, pose[:, 3] - self._depth * back, self._up)
+        client.camera._state.camera_cb.clear()  # of Nerfstudio's callback, for which see ours
+        client.camera.on_update(self._moved)
+        self.viewer.update_step(self.viewer.step)
+        renderer.start()
+
+    def _turn(self, client: viser.ClientHandle, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+        """Has a browser look from a place in the scene to another."""
+        with client.atomic():
+            self._fit(client.camera)
+            client.camera.up_direction = up
+            client.camera.position = position * VISER_NERFSTUDIO_SCALE_RATIO
+            client.camera.look_at = target * VISER_NERFSTUDIO_SCALE_RATIO
+
+    def _moved(self, view: viser.CameraHandle) -> None:
+        """Renders for a browser that says where it is.
+
+        Handles are heard in threads of their own, so that it may have gone since. Nerfstudio's own callback then fails
+        with viser's lock in hand, which nobody gives back: no message is sent any more, and Python does not end.
+        """
+        renderer = self.viewer.render_statemachines.get(view.client.client_id)
+        if renderer is not None:
+            self._fit(view)
+            self.viewer.last_move_time = time.time()  # type: ignore - starts as an int
+            renderer.action(RenderAction("move", self.viewer.get_camera_state(view.client)))
+
+    def _fit(self, view: viser.CameraHandle) -> None:
+        """Has a view show all that the sensor sees, also where panels make it narrow."""
+        camera = self._camera
+        half = 0.5 * max(camera.height / camera.fy, camera.width / camera.fx / view.aspect)
+        fov = 2.0 * float(np.arctan(half))
+        if abs(view.fov - fov) > 0.01:
+            view.fov = fov
+
+    @property
+    def _corrections_in_words(self) -> str:
+        words = self._manager.corrections.words
+        return f"Corrected: {'; '.join(words)}. Grey: the path as it was stated." if words else ""
+
+    def _pose(self, time_ns: int, trajectory: Trajectory | None = None) -> Float64[np.ndarray, "3 4"]:
+        """The sensor in the scene, OpenCV axes, on its own trajectory or on another one."""
+        pose = (trajectory or self._recording.trajectory).poses(torch.tensor(time_ns)).numpy()
+        rotation, shift = self._transform[:, :3], self._transform[:, 3]
+        return np.column_stack([rotation @ pose[:, :3], self._scale * (rotation @ pose[:, 3] + shift)])
+
+    @property
+    def _moment(self) -> int:
+        """The time of the slider, ns."""
+        first, last = self._recording.span
+        return min(max(round(self._time.value * 1e9), first), last)
+
+    def _move(self) -> None:
+        """Puts the sensor where it was at the time of the slider, and the views with it.
+
+        Handles are heard in threads of their own: one at a time, so that the last ends with the time as it then is.
+        """
+        with self._moves:
+            pose = self._pose(self._moment)
+            with self.viser_server.atomic():
+                self._sensor.position = pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+                self._sensor.wxyz = vtf.SO3.from_matrix(pose[:, :3]).wxyz
+            if self._follows.value:
+                for client in self.viser_server.get_clients().values():
+                    self._turn(client, pose[:, 3], pose[:, 3] + self._depth * pose[:, 2], -pose[:, 1])
+        self.viewer._trigger_rerender()
+
+    def _play(self) -> None:
+        """Moves the time on for as long as it is to play; from the end it goes on at the start."""
+        first, last = np.array(self._recording.span) * 1e-9
+        step = PLAY_STEP * min(1.0, (last - first) / PLAY_SECONDS)
+        while self._plays.value:
+            following = self._time.value + step
+            self._time.value = following if following <= last else first
+            time.sleep(PLAY_STEP)
+
+    def _seen_now(self) -> SeenRays:
+        assert self._model.seen_volume is not None
+        return SeenRays(self._model.seen_volume())
+
+    def _limit(self, rays: RayBundle, at_rest: bool) -> None:
+        """Has rays of a picture begin and end where something was seen, as far as that is known; finds out anew what
+        training has changed since.
+
+        Args:
+            rays: Shape (height, width); with nears and fars where they are to stay between these.
+            at_rest: There is time to find out what was seen.
+        """
+        step, model = self.viewer.step, self._model
+        if self.viewer.trainer is not None and step >= LOOKED_EVERY * self._looked_at:
+            self._look()
+            self._looked_at = max(step, 1)
+        if at_rest and self.viewer.trainer is not None and step >= max(FIRST_SEEN, SEEN_EVERY * self._seen_at):
+            self._seen = self._seen_now()
+            self._seen_at = step
+        if at_rest and self._manager.corrections is not self._path_of:
+            self._draw_path()
+            self._corrected.content = self._corrections_in_words
+        if self._seen is None or model.config.contraction:
+            return
+        nears, fars = self._seen.span(rays.origins, rays.directions)
+        if rays.nears is not None and rays.fars is not None:
+            nears, fars = torch.maximum(nears, rays.nears), torch.minimum(fars, rays.fars)
+        rays.nears, rays.fars = nears, fars
+
+    def _shown(self, outputs: Outputs, rays: RayBundle) -> Outputs:
+        """What the panel makes of what was rendered: rgb for the eye, with events; depth in metres.
+
+        Args:
+            outputs: Of the model, each of shape (height, width, its size).
+            rays: Of the picture, shape (height, width).
+        """
+        rgb, depth, share = outputs["rgb"], outputs["depth"], outputs["accumulation"]
+        points = rays.origins + rays.directions * depth
+        if self._seen is not None and not self._model.config.contraction:
+            is_seen = self._seen.may_be_surface(points)[..., None]
+            rgb, share = rgb * is_seen, share * is_seen
+        behind = rgb.new_tensor(self.viewer.control_panel.background_color) / 255.0
+        rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value, share, behind)
+        if self._events.value:
+            moment = self._moment
+            begin = moment - round(self._window.value * 1e6)
+            events = recent_events(self._manager.index, self._recording.camera, begin, moment)
+            rgb = draw_events(rgb, points, events, self._camera, self._pose(moment))
+        shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, share > 0.5)})
+        path = torch.from_numpy(self._path).to(rays.origins)
+        away = float((path - rays.origins[0, 0]).norm(dim=-1).min())
+        for handle in self._drawn:  # on the trajectory, it and the cameras are in the way
+            handle.visible = away > 4.0 * FRUSTUM * self._depth
+        return shown
+
+    def _in_metres(self, depth: Tensor, is_known: Tensor) -> Tensor:
+        """Depth in metres within what is known of the view, which is told."""
+        metres = depth / self._scale
+        known, (row, column) = metres[is_known], (side // 2 for side in metres.shape[:2])
+        content = "Nothing was seen here."
+        if len(known):
+            near, far = float(known.min()), float(known.max())
+            metres = metres.clamp(near, far)
+            middle = f"{float(metres[row, column]):.2f} m" if is_known[row, column] else "nothing"
+            content = f"In the middle: {middle}  \nIn view, as depth is coloured: {near:.2f} m to {far:.2f} m"
+        if content != self._depths.content:
+            self._depths.content = content
+        return metres

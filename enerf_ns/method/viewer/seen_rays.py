@@ -1,0 +1,68 @@
+"""Parts of rays in which something was seen, so that a picture shows no fog where nobody looked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from enerf_ns.rendering.seen_volume import SeenVolume
+
+COARSE = 80
+"""Rays along the longer side of a picture of which it is found out; those between are taken as their neighbours."""
+
+PLACES = 96
+"""Places on a ray through the box that are looked at; a step is about a voxel."""
+
+NOWHERE = 1e9
+"""Distance at which a ray begins and ends on which nothing was seen."""
+
+
+class SeenRays:
+    """Says of rays where they pass what was seen.
+
+    Surfaces are rendered a little nearer or farther from another side: they may lie in voxels that touch a seen one.
+
+    Args:
+        seen: What was seen.
+    """
+
+    def __init__(self, seen: SeenVolume):
+        self._seen = seen
+        padded = torch.nn.functional.max_pool3d(seen.is_seen[None].float(), 3, stride=1, padding=1)
+        self._around = replace(seen, is_seen=padded[0] > 0.0)
+
+    def may_be_surface(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether points (scene units) lie in voxels that were seen, or in ones that touch such."""
+        return self._around.seen(points)
+
+    def span(
+        self, origins: Float[Tensor, "height width 3"], directions: Float[Tensor, "height width 3"]
+    ) -> tuple[Float[Tensor, "height width 1"], Float[Tensor, "height width 1"]]:
+        """Distances from which on rays of a picture pass voxels that were seen, or somewhat before, and up to which
+        surfaces may be, or somewhat after; both `NOWHERE` where they pass none.
+
+        Args:
+            origins, directions: Of the rays; directions of length 1.
+        """
+        height, width = origins.shape[:2]
+        step = -(-max(height, width) // COARSE)
+        rows, columns = (torch.arange(0, side + step - 1, step, device=origins.device) for side in (height, width))
+        grid = torch.meshgrid(rows.clamp(max=height - 1), columns.clamp(max=width - 1), indexing="ij")
+        origins, directions = origins[grid], directions[grid]
+        to_faces = (self._seen.aabb[:, None, None] - origins) / directions.where(directions.abs() > 1e-12, 1e-12)
+        begins = to_faces.amin(0).amax(-1).clamp(min=0.0)
+        lengths = (to_faces.amax(0).amin(-1) - begins).clamp(min=0.0) / PLACES
+        places = begins + torch.arange(PLACES, device=begins.device)[:, None, None] * lengths
+        points = origins + directions * (places + 0.5 * lengths)[..., None]
+        nears = places.where(self._seen.seen(points), NOWHERE).amin(0)
+        fars = (places + lengths).where(self._around.seen(points), -NOWHERE).amax(0)
+        around = torch.nn.functional.max_pool2d(torch.stack([-nears, fars]), 3, stride=1, padding=1)
+        rows, columns = (
+            ((torch.arange(side, device=nears.device) + step // 2) // step).clamp(max=number - 1)
+            for side, number in zip((height, width), nears.shape, strict=True)
+        )
+        nears, fars = around[:, rows][:, :, columns, None]
+        return -nears, fars.where(fars > 0.0, NOWHERE)

@@ -1,8 +1,0 @@
-"""All extreme cases, in the order in which they are shown."""
-
-from enerf_ns.numerics import (  # isort: skip - in the order in which they are shown
-    poses, scene, drawing, brightness, rendering, training, scores, flags,
-)  # fmt: skip
-from enerf_ns.numerics.case import CASES
-
-__all__ = ["CASES", "brightness", "drawing", "flags", "poses", "rendering", "scene", "scores", "training"]

@@ -1,0 +1,268 @@
+"""Clocks, poses and focal length that events contradict are named, and those that they cannot contradict are not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import faults
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaking
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.inspection.agreement import Agreement
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
+
+CAMERA = Camera(160, 120, 150.0, 148.0, 81.0, 58.0, (-0.12, 0.05, 0.001, -0.0005), "radtan")
+STILL = Rotation.from_rotvec(np.zeros((2000, 3)))
+
+
+def points_seen(positions: np.ndarray, rotations: Rotation, camera: Camera = CAMERA) -> EventRecording:
+    """Events wherever OpenCV's projection of a point enters another pixel; poses are known each millisecond."""
+    events = []
+    points = points_between(1.0, 3.0)
+    coefficients = np.array(camera.distortion)
+    before = None
+    for step, (place, turn) in enumerate(zip(positions, rotations.inv(), strict=True)):
+        seen = turn.apply(points - place)
+        at = cv2.projectPoints(points, turn.as_rotvec(), -turn.apply(place), camera.matrix, coefficients)[0][:, 0]
+        pixels = np.rint(at).astype(int)
+        if before is not None:
+            inside = (pixels >= 0).all(1) & (pixels < [160, 120]).all(1) & (seen[:, 2] > 0.1)
+            moved = pixels[inside & (pixels != before).any(1)]
+            events.append(np.column_stack([moved, np.full(len(moved), step * 1_000_000)]))
+        before = pixels
+    x, y, t = np.concatenate(events).T
+    stream = Events(x.astype(np.uint16), y.astype(np.uint16), t, np.where(np.arange(len(t)) % 2, 1, -1).astype(np.int8))
+    trajectory = Trajectory(np.arange(len(positions)) * 1_000_000, positions, rotations.as_quat())
+    return EventRecording(
+        Path("memory"), "test", camera, trajectory, lambda: iter([stream]), (), depth_range=(0.8, 4.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def shaken() -> EventRecording:
+    return points_seen(shaking(0.1), TURNING)
+
+
+def agreement(recording: EventRecording) -> Agreement:
+    try:
+        depth_range = scene_depth_range(recording)
+    except RecordingError:
+        depth_range = None
+    found = Agreement.of(recording, depth_range)
+    assert found is not None
+    return found
+
+
+def words(found: Agreement) -> str:
+    return " ".join(problem.what + " " + problem.advice for problem in found.problems())
+
+
+@pytest.mark.parametrize("late", [0, 5, -23])
+def test_the_best_delay_of_the_poses_is_the_true_one(shaken: EventRecording, late: int):
+    found = agreement(faults.poses_late(shaken, late))
+    assert found.pose_delay.is_told and found.pose_delay.value == pytest.approx(late, abs=1.0)
+    assert bool(found.problems()) == (found.pixels(late) > 1)
+    assert found.frame_delay is None
+
+
+@pytest.mark.parametrize("factor", [0.92, 1.1])
+def test_the_best_focal_length_is_the_true_one(factor: float):
+    """Turning tells it: by 9 degrees here."""
+    turning = Rotation.from_rotvec(2.5 * TURNING.as_rotvec())
+    found = agreement(faults.longer_focal_length(points_seen(shaking(0.1), turning), factor))
+    assert found.focal_scale.is_told and found.focal_scale.value == pytest.approx(1 / factor, abs=0.02)
+    assert "focal length is wrong" in words(found)
+
+
+@pytest.mark.parametrize(
+    "lens", [CAMERA, Camera(160, 120, 110.0, 110.0, 81.0, 58.0, (-0.3, 0.1, 0.001, -0.0005), "radtan")]
+)
+def test_a_calibration_that_is_of_another_lens_is_named(lens: Camera):
+    """That which a sample has, without distortion; and neither clocks nor poses are blamed for it."""
+    recording = points_seen(shaking(0.1), TURNING, lens)
+    found = agreement(replace(recording, camera=Camera(160, 120, 200.0, 200.0, 80.0, 60.0)))
+    (problem,) = found.problems()
+    assert re.search(r"focal length is wrong: 0\.\d{3} ± 0\.0\d{2} of the stated one fits", problem.what)
+    assert 200 * found.focal_scale.value == pytest.approx(lens.fx, rel=0.12)  # some of it is distortion
+
+
+READINGS = pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        pytest.param(faults.inverse, "world to camera, the inverse", id="inverse"),
+        pytest.param(faults.scalar_first, "quaternions in the order w x y z", id="scalar first"),
+        pytest.param(faults.opengl, "OpenGL's camera axes with x right, y up, z backward", id="opengl"),
+        pytest.param(lambda read: faults.mirrored(read, 0), "mirrored axes with x left, y down, z forward", id="x"),
+        pytest.param(lambda read: faults.mirrored(read, 1), "mirrored axes with x right, y up, z forward", id="y"),
+    ],
+)
+
+
+@READINGS
+def test_poses_of_another_convention_are_named(
+    shaken: EventRecording, fault: Callable[[EventRecording], EventRecording], named: str
+):
+    found = agreement(fault(shaken))
+    assert [reading.words for reading in found.readings] == [named]
+    assert f"read as {named}: events are then" in words(found)
+
+
+def test_poses_of_a_body_are_reread_before_the_camera_is_mounted(shaken: EventRecording):
+    mount = np.eye(4)
+    mount[:3, :3], mount[:3, 3] = Rotation.from_euler("xyz", [0.7, -0.4, 1.9]).as_matrix(), [0.05, -0.02, 0.1]
+    body = shaken.trajectory.of_mounted(np.linalg.inv(mount))
+    x, y, z, w = body.quaternions.T
+    wrong = Trajectory(body.times, body.positions, np.stack([w, x, y, z], axis=1)).of_mounted(mount)
+    found = agreement(faults.with_poses(shaken, wrong))
+    assert [reading.words for reading in found.readings] == ["quaternions in the order w x y z"]
+
+
+def test_what_a_steady_slide_does_not_tell_is_said():
+    """At one speed a clock's delay moves the world alone, without turning a focal length trades with depth, and a half
+    turn about the direction of motion changes nothing."""
+    found = agreement(points_seen((PHASE / np.pi - 1) * [0.3, 0, 0], STILL))
+    assert not found.pose_delay.is_told and not found.problems()
+    assert found.verdict().endswith("the clock of the poses and the focal length cannot be told from this recording")
+    assert found.rows()["not told from"].startswith("OpenGL's camera axes")
+
+
+def test_poses_of_another_recording_bring_nothing_into_focus(shaken: EventRecording):
+    other = Trajectory(shaken.trajectory.times, shaking(0.1)[::-1] @ np.eye(3)[[1, 2, 0]], TURNING[::-1].as_quat())
+    assert "No reading of the poses" in words(agreement(faults.with_poses(shaken, other)))
+
+
+def test_few_events_say_nothing(tmp_path: Path):
+    from recordings import write_esim
+
+    assert Agreement.of(read_recording(write_esim(tmp_path / "esim")), (1.0, 2.0)) is None
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
+    folder = tmp_path_factory.mktemp("shapes") / "recording"
+    simulate(SimulationSettings("shapes", motion="shake", duration=0.6, num_frames=24, width=120, height=90), folder)
+    return read_recording(folder)
+
+
+@pytest.mark.slow
+def test_a_simulated_recording_is_sound(simulated: EventRecording):
+    found = agreement(simulated)
+    assert found.problems() == [] and found.is_clear and len(found.readings) == 1
+    assert found.pose_delay.is_told and abs(found.pose_delay.value) < 0.5
+    assert found.frame_delay is not None and found.frame_delay.is_told and abs(found.frame_delay.value) < 1.0
+    assert found.focal_scale.is_told and found.focal_scale.value == pytest.approx(1.0, abs=0.01)
+    assert found.corners is not None and found.corners.focal_scale.is_told
+    assert found.corners.focal_scale.value == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [10, -10])
+def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
+    found = agreement(faults.poses_late(simulated, late))
+    assert found.pose_delay.value == pytest.approx(late, abs=0.5)
+    assert f"the poses are stamped {abs(found.pose_delay.value):.1f} ms {'late' if late > 0 else 'early'}" in words(
+        found
+    )
+    assert "to the times of the poses" in words(found) or "off the times of the poses" in words(found)
+
+    found = agreement(faults.frames_late(simulated, late))
+    assert found.frame_delay is not None and found.frame_delay.value == pytest.approx(late, abs=1.0)
+    assert "the times of the frames" in words(found)
+
+
+@pytest.mark.slow
+@READINGS
+def test_conventions_of_a_simulated_recording(
+    simulated: EventRecording, fault: Callable[[EventRecording], EventRecording], named: str
+):
+    assert f"read as {named}: events are then" in words(agreement(fault(simulated)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 1.1, 0.3, 0.6, 0.8, 1.25, 1.7, 3.0])
+def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor: float):
+    found = agreement(faults.longer_focal_length(simulated, factor))
+    assert found.focal_scale.value == pytest.approx(1 / factor, rel=0.025)
+    assert found.problems()[0].what.startswith("The focal length is wrong: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.5])
+def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRecording, factor: float):
+    """Their camera alone is stated wrongly: what events say stays as it is."""
+    wrong = faults.longer_focal_length(simulated, factor)
+    found = agreement(replace(simulated, frames=wrong.frames, blurred_frames=wrong.blurred_frames))
+    assert found.corners is not None and found.corners.focal_scale.is_told
+    assert found.corners.focal_scale.value == pytest.approx(1 / factor, rel=0.01)
+    (problem,) = found.problems()
+    assert problem.what.startswith("The focal length of the frames is wrong: ")
+    assert "corners are" in found.rows()["focal length by frames"]
+
+
+@pytest.fixture(scope="module")
+def slider(shared_data: Path) -> EventRecording:
+    return read_recording(shared_data / "slider_depth")
+
+
+@pytest.mark.slow
+def test_slider_depth_is_sound(slider: EventRecording):
+    """Its events are some milliseconds later than its frames and, by its turning point, than its poses."""
+    found = agreement(slider)
+    assert found.problems() == []
+    assert found.frame_delay is not None and found.pose_delay.is_told and found.frame_delay.is_told
+    assert found.pose_delay.value == pytest.approx(found.frame_delay.value, abs=3.0)
+    assert "focal length cannot be told" in found.verdict()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [10, -10])
+@pytest.mark.parametrize("fault", [faults.poses_late, faults.frames_late])
+def test_clocks_of_slider_depth(
+    slider: EventRecording, fault: Callable[[EventRecording, int], EventRecording], late: int
+):
+    """What tells the clock of its poses is where it turns back at its end."""
+    sound, found = agreement(slider), agreement(fault(slider, late))
+    assert sound.frame_delay and found.frame_delay
+    moved = found.pose_delay.value - sound.pose_delay.value, found.frame_delay.value - sound.frame_delay.value
+    expected = (late, 0) if fault is faults.poses_late else (0, late)
+    assert moved == pytest.approx(expected, abs=2.0)
+    assert words(found).startswith("The clocks disagree by ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        pytest.param(faults.inverse, "read as world to camera, the inverse, or", id="inverse"),
+        pytest.param(lambda read: faults.mirrored(read, 0), "mirrored axes with x left, y down, z forward, or", id="x"),
+        pytest.param(faults.scalar_first, "which in the order w x y z, or with OpenGL's axes", id="scalar first"),
+        pytest.param(faults.opengl, "which in the order w x y z, or with OpenGL's axes", id="opengl"),
+    ],
+)
+def test_conventions_of_slider_depth(
+    slider: EventRecording, fault: Callable[[EventRecording], EventRecording], named: str
+):
+    """It slides without turning: several readings that point it the same way cannot be told apart."""
+    found = words(agreement(fault(slider)))
+    assert named in found and "this motion" in found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.6, 0.9, 1.1, 1.7])
+def test_focal_length_of_slider_depth_cannot_be_told(slider: EventRecording, factor: float):
+    found = agreement(faults.longer_focal_length(slider, factor))
+    assert not found.focal_scale.is_told and "focal length cannot be told" in found.verdict()
+    assert found.corners is not None and not found.corners.focal_scale.is_told

@@ -1,0 +1,66 @@
+"""Noise of poses: told where there is some, and taken off; nothing is taken off what is smooth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from enerf_ns.dataparsers.recording.pose_noise import pose_noise
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+
+
+def moving(noise: float, degrees: float, poses: int = 400) -> tuple[Trajectory, np.ndarray, Rotation]:
+    """A camera that shakes at 3 Hz for two seconds, 200 poses a second; its poses with noise, and without."""
+    random, seconds = np.random.default_rng(0), np.arange(poses) / 200.0
+    phase = 6.0 * np.pi * seconds
+    positions = 0.05 * np.stack([np.sin(phase), np.cos(phase), np.sin(0.5 * phase)], axis=1)
+    turns = Rotation.from_rotvec(0.1 * np.stack([np.cos(phase), np.sin(0.7 * phase), 20.0 * seconds], axis=1))
+    noisy = turns * Rotation.from_rotvec(np.radians(degrees) * random.normal(size=(poses, 3)))
+    quaternions = noisy.as_quat() * np.where(random.random(poses) < 0.5, -1.0, 1.0)[:, None]  # either is the same
+    given = positions + noise * random.normal(size=(poses, 3))
+    return Trajectory((seconds * 1e9).astype(np.int64), given, quaternions), positions, turns
+
+
+def test_noise_is_told_and_halved():
+    given, positions, turns = moving(1e-3, 0.1)
+    noise = pose_noise(given)
+    assert noise is not None
+    assert noise.position == pytest.approx(1e-3, rel=0.25) and np.degrees(noise.rotation) == pytest.approx(0.1, rel=0.3)
+    smooth = noise.smooth
+    assert np.sqrt(((smooth.positions - positions) ** 2).mean()) < 0.5e-3
+    off = (turns.inv() * Rotation.from_quat(smooth.quaternions)).as_rotvec()
+    assert np.degrees(np.sqrt((off**2).mean())) < 0.05
+    assert noise.pixels(500.0, 2.0) == pytest.approx(500 * np.hypot(noise.position / 2, noise.rotation))
+
+
+def test_what_is_smooth_stays():
+    given, positions, turns = moving(0.0, 0.0)
+    noise = pose_noise(given)
+    assert noise is not None and noise.pixels(500.0, 1.0) < 0.01
+    np.testing.assert_allclose(noise.smooth.positions, positions, atol=1e-5)
+    off = (turns.inv() * Rotation.from_quat(noise.smooth.quaternions)).magnitude()
+    assert off.max() < 1e-4
+
+
+def test_a_camera_that_stands_still_does_not_move():
+    times = np.arange(50) * 5_000_000
+    given = Trajectory(times, np.tile([1.0, 2.0, 3.0], (50, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (50, 1)))
+    noise = pose_noise(given)
+    assert noise is not None and noise.position < 1e-12
+    np.testing.assert_allclose(noise.smooth.positions, given.positions, atol=1e-9)
+
+
+def test_of_few_poses_nothing_is_told():
+    given, _, _ = moving(1e-3, 0.1, poses=10)
+    assert pose_noise(given) is None
+
+
+def test_a_mounted_camera_stays_mounted():
+    given, _, _ = moving(1e-3, 0.1)
+    mount = np.eye(4)
+    mount[:3, 3] = [0.1, 0.0, -0.2]
+    noise = pose_noise(given.of_mounted(mount))
+    assert noise is not None and noise.smooth.body is not None
+    again = noise.smooth.body[0].of_mounted(mount)
+    np.testing.assert_allclose(again.positions, noise.smooth.positions, atol=1e-9)

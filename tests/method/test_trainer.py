@@ -1,0 +1,146 @@
+"""What training shows and stores."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.utils.rich_utils import CONSOLE
+from small_runs import set_up, small_config
+
+from enerf_ns.choices.resolver import MEAN_BRIGHTNESS
+from enerf_ns.choices.table import choices_table, recording_table
+from enerf_ns.dataparsers.recording.errors import FlagError
+from enerf_ns.method.config import enerf
+from enerf_ns.sensor.response import Linlog
+
+
+def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, monkeypatch):
+    """Choices are stored beside what was set, paths are absolute; what was stored loads and prints as it was."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(recording)
+    config = small_config(Path("link"), Path("outputs"))
+    config.save_config()
+    run = tmp_path / "outputs/recording/enerf/run"
+    loaded = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    assert loaded == loaded.resolved() == replace(config.resolved(), experiment_name="recording")
+    assert loaded.pipeline.model.num_channels is None and loaded.pipeline.datamanager.dataparser.depth_range is None
+    filled = loaded.pipeline.resolution.applied_to(loaded.pipeline)
+    manager, model = filled.datamanager, filled.model
+    for path in (loaded.data, manager.data, manager.dataparser.data):
+        assert path == recording.resolve()
+    assert loaded.output_dir == tmp_path / "outputs"
+    simulated = json.loads((recording / "simulation.json").read_text())
+    assert model.sensor.contrast_thresholds == tuple(simulated["contrast_thresholds"])
+    assert manager.dataparser.depth_range == pytest.approx(simulated["depth_range"])
+    assert model.num_channels == 1 and model.max_res > model.base_res and 0 < model.near_plane < 1
+    choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
+    assert choices["event loss"]["kept"] and not choices["silent pixels"]["kept"] and not choices["frame loss"]["kept"]
+    assert all(choice["why"] and choice["flag"] for choice in choices.values())
+
+
+@pytest.mark.parametrize("name, message", [("cuda", "must be auto, torch, triton or numba"), ("numba", "on meta")])
+def test_a_hash_grid_that_does_not_fit_the_device_is_refused(recording: Path, tmp_path: Path, name: str, message: str):
+    config = small_config(recording, tmp_path)
+    config.pipeline.model.hash_grid = name
+    config.machine.device_type = "meta"  # type: ignore[assignment] - a device that is everywhere, and not the CPU
+    with pytest.raises(FlagError, match=f"--pipeline.model.hash-grid.*{message}"):
+        config.resolved()
+
+
+def test_the_learning_rate_falls_to_a_tenth_at_the_last_step_however_long_the_run(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations = 7
+    trainer = set_up(config)
+    rates = []
+    for step in range(8):
+        rates.append(trainer.optimizers.optimizers["fields"].param_groups[0]["lr"])
+        trainer.train_iteration(step)
+    ratio = np.array(rates[1:]) / np.array(rates[:-1])
+    np.testing.assert_allclose(ratio, 0.1 ** (1 / 7), rtol=1e-6)
+
+
+def test_resuming_from_what_was_stored_prints_the_same_table(recording: Path, tmp_path: Path, capsys):
+    """What was chosen does not come to count as set by flag."""
+    config = small_config(recording, tmp_path)
+    config.save_config()
+    first = capsys.readouterr().out
+    stored = tmp_path / "recording/enerf/run/config.yml"
+    again = yaml.load(stored.read_text(), Loader=yaml.Loader)
+    again.save_config()
+    table, again_table = (
+        text[text.index("Parts of the method") : text.index("forced by")] for text in (first, capsys.readouterr().out)
+    )
+    assert again_table == table
+    assert "the recording" in table and "measured" not in table
+    assert yaml.load(stored.read_text(), Loader=yaml.Loader) == again
+
+
+def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, tmp_path: Path):
+    """Its choices stand in the config itself, and its sensor is two thresholds of the model."""
+    config = small_config(recording, tmp_path, sensor__contrast_thresholds=(0.3, 0.2)).resolved()
+    old = config.pipeline.resolution.applied_to(config.pipeline)
+    text = yaml.dump(old)
+    state = yaml.load(text, Loader=yaml.Loader)
+    model = state.model.__dict__
+    model["contrast_thresholds"] = model.pop("sensor").contrast_thresholds
+    model["hidden_dim_color"] = model.pop("hidden_dim_colour") + 8
+    del model["contraction"], model["init_density"], model["mean_brightness"]
+    del state.__dict__["defaults"], state.__dict__["resolution"]
+    loaded = yaml.load(yaml.dump(state), Loader=yaml.Loader)
+    assert loaded.model.sensor.contrast_thresholds == (0.3, 0.2)
+    pipeline = loaded.setup(device="cpu", test_mode="test")
+    assert pipeline.model.sensor.contrast_thresholds == (0.3, 0.2)
+    assert pipeline.model.sensor.response == Linlog()
+    assert pipeline.config.model.hidden_dim_colour == old.model.hidden_dim_colour + 8
+    assert pipeline.config.model.max_res == old.model.max_res and pipeline.config.model.contraction is False
+    assert pipeline.config.model.init_density == 0.01 == pipeline.model.field.geometry.init_density
+    assert pipeline.config.model.mean_brightness == MEAN_BRIGHTNESS
+
+
+def test_without_data_it_says_which_flag_is_missing(tmp_path: Path):
+    config = copy.deepcopy(enerf.config)
+    with pytest.raises(SystemExit, match=r"enerf: --data is missing"):
+        config.save_config()
+
+
+@pytest.mark.parametrize("place", ["data", "manager", "parser"])
+def test_the_recording_may_be_named_in_any_place(recording: Path, tmp_path: Path, place: str):
+    config = small_config(recording, tmp_path)
+    config.data = recording if place == "data" else None
+    config.pipeline.datamanager.data = recording if place == "manager" else None
+    config.pipeline.datamanager.dataparser.data = recording if place == "parser" else Path()
+    used = config.resolved()
+    assert used.data == used.pipeline.datamanager.data == used.pipeline.datamanager.dataparser.data == recording
+
+
+def test_the_tables_name_what_there_is(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path).resolved()
+    with CONSOLE.capture() as captured:
+        CONSOLE.print(recording_table(config.pipeline.datamanager.dataparser))
+        CONSOLE.print(choices_table(config.pipeline.resolution.choices))
+    text = captured.get()
+    for expected in ("32 x 24, pinhole", "11, 32 x 24, with depth", "blurred frames", "kept", "left out"):
+        assert expected in text
+
+
+def test_a_run_is_the_same_on_any_number_of_threads(recording: Path, tmp_path: Path):
+    before, parameters = torch.get_num_threads(), []
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            config = small_config(recording, tmp_path / str(number), data__event_pairs=2000)
+            trainer = set_up(config)
+            trainer.pipeline.train()
+            for step in range(3):
+                trainer.train_iteration(step)
+            parameters.append(trainer.pipeline.model.state_dict())
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(parameters[0][name], value) for name, value in parameters[1].items())

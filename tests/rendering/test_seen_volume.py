@@ -1,0 +1,131 @@
+"""What was seen, and where events came from: against a slow loop, and before a wall."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.model_components.scene_colliders import NearFarCollider
+from small_runs import set_up, small_config
+
+from enerf_ns.method.model import BoxCollider
+from enerf_ns.rendering.seen_volume import STEPS_A_VOXEL, SeenVolume, around, counts, numbers_of, passed, voxels_of
+
+WALL = 0.3
+
+
+class WallModel:
+    """An endless wall at y = 0.3 of the scene, which all rays hit that look its way."""
+
+    def __init__(self, aabb: torch.Tensor, collider: Any):
+        self.scene_box, self.collider, self.training = SceneBox(aabb), collider, True
+
+    def train(self, mode: bool = True) -> None:
+        self.training = mode
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, torch.Tensor]:
+        assert not self.training
+        rays = camera_ray_bundle
+        assert rays.fars is not None
+        depth = (WALL - rays.origins[..., 1:2]) / rays.directions[..., 1:2]
+        return {"depth": torch.where(depth > 0, depth, rays.fars)}
+
+
+@pytest.fixture(scope="module")
+def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return set_up(small_config(recording, tmp_path_factory.mktemp("outputs"))).pipeline
+
+
+@pytest.mark.parametrize("contraction", [False, True])
+def test_behind_a_wall_nothing_is_seen_and_before_it_all_that_the_camera_looks_at(pipeline: Any, contraction: bool):
+    box, manager = pipeline.model.scene_box, pipeline.datamanager
+    near = pipeline.model.config.near_plane
+    collider = NearFarCollider(near, 1000.0, reset_near_plane=False) if contraction else BoxCollider(box, near)
+    model: Any = WallModel(box.aabb, collider)
+    volume = SeenVolume.of(model, manager.recording, manager.index, manager.event_camera)
+    assert model.training  # as it was
+
+    voxel = 2.0 / 64
+    camera, recording = manager.event_camera, manager.recording
+    middle = camera.camera.height // 2 * camera.camera.width + camera.camera.width // 2
+    rays = camera.rays(torch.tensor([middle]), torch.from_numpy(recording.instants(3)[1:2]))
+    origin, direction = rays.origins[0], rays.directions[0]
+    assert direction[1] > 0.5  # the camera looks along y
+    hit = float((WALL - origin[1]) / direction[1])
+    looked_through = origin + direction * torch.linspace(near, hit, 50)[:, None]
+    looked_through = looked_through[(looked_through > box.aabb[0]).all(-1)]
+    assert volume.seen(looked_through).all()
+
+    aabb = volume.aabb
+    points = aabb[0] + torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * (aabb[1] - aabb[0])
+    behind = points[:, 1] > WALL + 3 * voxel
+    assert behind.sum() > 1000
+    assert not volume.seen(points[behind]).any()
+    assert not volume.events(points[behind]).any()
+    assert not volume.seen(2.0 * aabb).any() and not volume.events(2.0 * aabb).any()
+    everywhere = (points[:, 1] - WALL).abs() > 3 * voxel
+    assert not volume.events(points[everywhere]).any()
+
+    events = manager.index.events()
+    pixels = torch.from_numpy(events.y.astype(int) * camera.camera.width + events.x)
+    rays = camera.rays(pixels, torch.from_numpy(events.t))
+    ends = rays.origins + rays.directions * ((WALL - rays.origins[:, 1:2]) / rays.directions[:, 1:2])
+    for end in ends[:: len(ends) // 5]:
+        distance = ((ends - end).abs() / voxel).amax(-1)
+        assert (distance < 0.9).sum() * 0.7 <= volume.events(end) <= (distance < 2.1).sum() * 1.3
+
+
+def test_voxels_passed_are_those_that_a_loop_over_exact_chords_finds():
+    generator = np.random.default_rng(0)
+    aabb = torch.tensor([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.25]])
+    shape, number = torch.Size((16, 8, 4)), 60
+    origins = generator.uniform(-1.5, 1.5, (number, 3))
+    directions = generator.normal(size=(number, 3))
+    directions[0] = [1.0, 0.0, 0.0]  # along an axis
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    begins, ends = generator.uniform(0, 0.5, (number, 1)), generator.uniform(0.5, 2.5, (number, 1))
+    tensors = [torch.from_numpy(column).float() for column in (origins, directions, begins, ends)]
+    found = passed(aabb, shape, *tensors).numpy()
+
+    longest, voxel = np.zeros(tuple(shape)), 2.0 / 16
+    low = aabb[0].numpy()
+    for origin, direction, begin, end in zip(origins, directions, begins[:, 0], ends[:, 0], strict=True):
+        for place in np.ndindex(*shape):
+            corner = low + voxel * np.array(place)
+            with np.errstate(divide="ignore"):
+                cuts = np.sort(np.stack([corner - origin, corner + voxel - origin]) / direction, axis=0)
+            chord = min(cuts[1].min(), end) - max(cuts[0].max(), begin)
+            longest[place] = max(longest[place], chord)
+    assert found.any() and not found.all()
+    assert found[longest > voxel / STEPS_A_VOXEL + 1e-4].all()
+    assert not found[longest < -1e-4].any()
+
+
+def test_counts_and_their_surroundings_are_those_of_a_loop():
+    aabb = torch.tensor([[0.0, 0.0, 0.0], [4.0, 2.0, 3.0]])
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 6.0 - 1.0
+    shape = torch.Size((4, 2, 3))
+    expected = np.zeros(tuple(shape))
+    for point in points.numpy():
+        if (point >= 0).all() and (point < [4, 2, 3]).all():
+            expected[tuple(point.astype(int))] += 1
+    found = counts(aabb, shape, points)
+    np.testing.assert_array_equal(found.numpy(), expected)
+    smoothed = around(found).numpy()
+    for x, y, z in np.ndindex(*shape):
+        near = expected[max(x - 1, 0) : x + 2, max(y - 1, 0) : y + 2, max(z - 1, 0) : z + 2]
+        assert smoothed[x, y, z] == pytest.approx(near.sum(), rel=1e-5)
+
+
+def test_voxels_are_about_cubes_and_what_is_no_number_lies_in_none():
+    aabb = torch.tensor([[-1.0, -0.5, -0.01], [1.0, 0.5, 0.01]])
+    assert voxels_of(aabb) == (64, 32, 1)
+    _, inside = numbers_of(
+        aabb, voxels_of(aabb), torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0, 0, 0]])
+    )
+    assert inside.tolist() == [False, False, True]
