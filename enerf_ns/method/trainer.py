@@ -109,6 +109,9 @@ class EnerfTrainerConfig(TrainerConfig):
         """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
         recording (`pipeline.resolution`), whose events are read and checked.
 
+        What was chosen is kept with this config and its copies until a setting changes: Nerfstudio stores config.yml,
+        and then sets up a process for each device, where another measurement would give another batch.
+
         Raises:
             RecordingError: The recording cannot be used, or the checkpoint to go on from.
             FlagError: A setting cannot be followed.
@@ -117,6 +120,8 @@ class EnerfTrainerConfig(TrainerConfig):
         check_ranges(self)
         self._check_device()
         config = deepcopy(self)
+        asked = yaml.dump([self.data, self.preset, self.machine, self.optimizers, self.pipeline])
+        known = config.__dict__.pop("_resolution", None)
         pipeline, parser = config.pipeline, config.pipeline.datamanager.dataparser
         data = self.data or pipeline.datamanager.data or (parser.data if parser.data != Path() else None)
         if data is None:
@@ -131,7 +136,9 @@ class EnerfTrainerConfig(TrainerConfig):
         for name, group in config.optimizers.items():
             scheduler = group["scheduler"]
             scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
-        if not pipeline.resolution.choices:
+        if known is not None and known[0] == asked:
+            pipeline.resolution = known[1]
+        elif not pipeline.resolution.choices:
             recording = parser.setup().recording()
             optimizer, device = config.optimizers["fields"]["optimizer"], config.machine.device_type
             pipeline.resolution = resolve(
@@ -141,6 +148,7 @@ class EnerfTrainerConfig(TrainerConfig):
                 lambda filled: view_direction_gain(filled, optimizer, device),
                 lambda filled: batch_factor(filled, device),
             )
+            self._resolution = asked, deepcopy(pipeline.resolution)
         if checkpoint:
             config._check_fits(checkpoint)
         index_events(config.recording())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from small_runs import set_up, small_config
 from enerf_ns.choices.resolver import MEAN_BRIGHTNESS
 from enerf_ns.choices.table import choices_table, recording_table
 from enerf_ns.dataparsers.recording.errors import FlagError
+from enerf_ns.method import trainer as trainer_module
 from enerf_ns.method.config import enerf
 from enerf_ns.sensor.response import Linlog
 
@@ -43,6 +45,25 @@ def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, mon
     choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
     assert choices["event loss"]["kept"] and not choices["silent pixels"]["kept"] and not choices["frame loss"]["kept"]
     assert all(choice["why"] and choice["flag"] for choice in choices.values())
+
+
+def test_all_ranks_train_with_what_config_yml_states_though_each_would_measure_something_else(
+    recording: Path, tmp_path: Path, monkeypatch
+):
+    """Nerfstudio stores the config, and then hands it over to the process of each device."""
+    factors = iter([2, 4, 8])
+    monkeypatch.setattr(trainer_module, "batch_factor", lambda filled, device: next(factors))
+    config = small_config(recording, tmp_path)
+    data = config.pipeline.datamanager
+    data.event_pairs = data.silent_pairs = data.train_num_rays_per_batch = None
+    config.save_config()
+    stored = yaml.load((tmp_path / "recording/enerf/run/config.yml").read_text(), Loader=yaml.Loader)
+    for rank in (pickle.loads(pickle.dumps(config)), config, copy.deepcopy(config)):
+        assert rank.resolved().pipeline.resolution == stored.pipeline.resolution
+    pairs = stored.pipeline.resolution.values["datamanager.event_pairs"]
+    config.machine.seed += 1
+    changed = config.resolved().pipeline.resolution.values["datamanager.event_pairs"]
+    assert changed == 2 * pairs, "what is asked for anew is resolved anew"
 
 
 @pytest.mark.parametrize("name, message", [("cuda", "must be auto, torch, triton or numba"), ("numba", "on meta")])
