@@ -1,5 +1,6 @@
 # make demo    set up, then simulate events, train on them, evaluate and render: outputs/demo/
 # make test    set up, then run every check and every test
+# make docs    set up, then write the pages as a site: build/docs/index.html (Python 3.11 or later)
 # make lint    the checks alone;   make format   repair what can be repaired;   make clean   undo the set-up
 # PYTHON=...   the interpreter to set up with (3.10 to 3.12)
 
@@ -9,7 +10,7 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.10 python3; do \
 # The name of the stamp changes with what it depends on, so that an unchanged set-up costs nothing, a fresh checkout included.
 STAMP := .venv/set-up-$(shell cat pyproject.toml constraints.txt | cksum | cut -d' ' -f1)
 
-.PHONY: demo test lint format clean
+.PHONY: demo test docs lint format clean
 
 demo: $(STAMP)
 	.venv/bin/enerf demo --output-dir outputs/demo
@@ -23,6 +24,9 @@ lint: $(STAMP)
 	rm -rf build && .venv/bin/python -m pip install --quiet --no-deps --no-build-isolation --no-compile \
 	    --target build/typecheck . && cp -r tests benchmarks pyproject.toml build/typecheck
 	cd build/typecheck && PYRIGHT_PYTHON_IGNORE_WARNINGS=1 ../../.venv/bin/pyright --pythonpath ../../.venv/bin/python
+
+docs: $(STAMP)
+	.venv/bin/sphinx-build -q -W --keep-going -E docs build/docs
 
 format: $(STAMP)
 	.venv/bin/ruff check --fix

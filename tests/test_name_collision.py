@@ -1,4 +1,4 @@
-"""Another package that registers the name enerf, as SaENeRF does; what the README says of it."""
+"""Another package that registers the name enerf, as SaENeRF does; what its page says of it."""
 
 from __future__ import annotations
 
@@ -34,6 +34,6 @@ def test_the_package_that_is_found_first_has_the_name_and_nobody_is_told(other_f
 
 
 def test_the_variable_of_the_readme_gives_the_name_back(other_first, monkeypatch: pytest.MonkeyPatch):
-    (value,) = re.findall(r"export NERFSTUDIO_METHOD_CONFIGS=(\S+)", (ROOT / "README.md").read_text())
+    (value,) = re.findall(r"export NERFSTUDIO_METHOD_CONFIGS=(\S+)", (ROOT / "docs" / "limits.md").read_text())
     monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", value)
     assert discover_methods()[1]["enerf"].startswith("E-NeRF")

@@ -1,4 +1,4 @@
-"""The tables of the READMEs are those that `enerf bench` makes of the committed result files."""
+"""The tables of README and pages are those that `enerf bench` makes of the committed result files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from enerf_ns.bench.tables import markdown
 
 ROOT = Path(__file__).parents[1]
-READMES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md"]
+READMES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TABLE = re.compile(r"<!-- enerf bench (\S+): (\S+) -->\n(.*?)<!-- end of (\S+) -->", re.DOTALL)
 
 
@@ -33,6 +33,12 @@ def test_every_table_of_a_readme_is_that_of_its_result_file(readme: Path):
         results = json.loads((ROOT / file).read_text())
         assert results["experiment"] == name
         assert text.strip("\n") == markdown(results).strip("\n"), f"{readme.name} is not what {file} says"
+
+
+def test_the_rows_of_the_readme_are_those_of_the_page_of_results():
+    page = (ROOT / "docs" / "results.md").read_text()
+    rows = [line.removesuffix("|") for line in (ROOT / "README.md").read_text().splitlines() if "±" in line]
+    assert len(rows) == 9 and all(f"\n{row}|" in page for row in rows)
 
 
 def test_every_result_file_is_shown_and_from_one_version_of_the_code():

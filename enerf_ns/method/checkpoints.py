@@ -29,10 +29,17 @@ def read_config(path: Path) -> TrainerConfig:
         path: Its config.yml.
 
     Raises:
-        RecordingError: The file is missing, cannot be read, or is of no run.
+        RecordingError: The file is missing, cannot be read, or is of no run, or of an earlier version.
     """
     with reading(path, "the config.yml of a run"):
-        config = yaml.load(path.read_text(), Loader=yaml.Loader)  # as Nerfstudio reads it
+        text = path.read_text()
+        try:
+            config = yaml.load(text, Loader=yaml.Loader)  # as Nerfstudio reads it
+        except yaml.constructor.ConstructorError as error:
+            raise RecordingError(
+                f"{path} was written by another version of the software ({error.problem}); edit it as docs/training.md "
+                "shows under “Runs of earlier versions”, or train anew."
+            ) from error
     if not isinstance(config, TrainerConfig):
         raise RecordingError(f"{path} is not the config.yml of a run; give the folder of a run.")
     return config

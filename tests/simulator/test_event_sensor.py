@@ -804,10 +804,10 @@ def test_pictures_that_do_not_follow_are_refused():
         sensor.advance(np.ones((3, 4)), 50)
 
 
-def test_the_lines_in_the_readme():
+def test_the_lines_on_the_page():
     """A pixel fires once a threshold of every rise and fall, but for the last one begun before each turn."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    (lines,) = [lines for lines in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "adaptive_renders" in lines]
+    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+    (lines,) = [lines for lines in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "adaptive_renders" in lines]
     printed: list[tuple[Any, ...]] = []
     exec(lines, {"print": lambda *columns: printed.append(columns)})
     assert [columns[0] for columns in printed] == list(range(5_000_000, 100_000_001, 5_000_000))

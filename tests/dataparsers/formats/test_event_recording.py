@@ -326,14 +326,12 @@ def test_a_camera_that_moves_against_the_other_is_refused(tmp_path: Path):
         event_recording.write(recording, tmp_path / "again")
 
 
-# ----------------------------------------------------------------------------------------------------------- README
+# ----------------------------------------------------------------------------------------------------------- page
 
 
-def test_the_lines_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    readme = (Path(__file__).parents[3] / "README.md").read_text()
-    blocks = [block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "recording.json" in block]
-    if not blocks:
-        pytest.skip("README.md has no lines that write a recording")
+def test_the_lines_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
+    blocks = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "recording.json" in block]
     monkeypatch.chdir(tmp_path)
     x, y, t, p = EVENTS.T
     exec(blocks[0], {"x": x, "y": y, "t": t, "p": p, "pose_times": POSE_TIMES, "poses": poses()})
