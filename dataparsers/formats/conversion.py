@@ -111,7 +111,7 @@ def convert_event_file(
     missing += ["model, fx, fy, cx, cy and distortion of the camera in recording.json"] * (camera is None)
     if missing:
         sentences.append(
-            f"Before training, add {' and '.join(missing)}, as docs/formats.md shows under “Write a recording yourself”."
+            f"Before training, add {' and '.join(missing)}, as docs/formats.md shows (“Write a recording yourself”)."
         )
     return sentences
 
