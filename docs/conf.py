@@ -1,10 +1,51 @@
 """The pages as a site: `make docs` writes it to build/docs/."""
 
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
 project = "enerf-ns"
 author = "The enerf-ns developers"
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "sphinx_book_theme"
 html_title = "enerf-ns"
 html_theme_options = {"show_toc_level": 2, "use_download_button": False, "navbar_persistent": []}
 html_show_sourcelink = False
 myst_heading_anchors = 3
+default_role = "code"
+suppress_warnings = ["ref.python"]  # the names of axes in shapes are no names of classes
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_use_rtype = False
+
+COMMANDS_PAGE = Path(__file__).with_name("commands.md")
+
+
+def write_commands(app: Any) -> None:
+    """Writes the page of all commands and their flags, as each says them itself."""
+    from enerf_ns.scripts.cli import COMMANDS
+
+    programs = {f"enerf {name}": ["enerf", name] for name in COMMANDS} | {"ns-train enerf": ["ns-train", "enerf"]}
+    environment = {**os.environ, "COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
+
+    def said(program: list[str]) -> str:
+        path = Path(sys.executable).with_name(program[0])
+        command = [path, *program[1:], "--help"]
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        texts = list(pool.map(said, programs.values()))
+    sections = [f"## {name}\n\n```text\n{text.strip()}\n```" for name, text in zip(programs, texts, strict=True)]
+    head = "# Commands and flags\n\nWhat each command says with `--help`. Flags of `ns-train enerf` stand last."
+    COMMANDS_PAGE.write_text("\n\n".join([head, *sections]) + "\n")
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("builder-inited", write_commands)

@@ -101,7 +101,7 @@ def backend_of(name: str, x: Tensor, table: Tensor) -> str:
 
     Args:
         name: "torch", one of `BACKENDS`, or "auto": of these the first that fits, else "torch".
-        x: positions, shape (*batch, 3).
+        x: positions, shape `(*batch, 3)`.
         table: rows, shape (levels * T, features).
 
     Raises:
