@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 WRITTEN_BY_SPHINX = ROOT / "docs" / "commands.md"
 DOCS = sorted({*(ROOT / "docs").glob("*.md")} - {WRITTEN_BY_SPHINX})
-PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *DOCS]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "README.md", *DOCS]
 
 
 def anchors(page: Path) -> set[str]:
@@ -49,4 +49,6 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path):
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", ROOT / "docs", tmp_path / "site"]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    assert {page.stem for page in [*DOCS, WRITTEN_BY_SPHINX]} <= {file.stem for file in (tmp_path / "site").glob("*.html")}
+    assert {page.stem for page in [*DOCS, WRITTEN_BY_SPHINX]} <= {
+        file.stem for file in (tmp_path / "site").glob("*.html")
+    }

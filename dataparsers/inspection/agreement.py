@@ -434,7 +434,10 @@ def _coarse(largest: int) -> np.ndarray:
 
 
 def _delay(curve: Callable[[np.ndarray], np.ndarray], largest: int) -> Estimate:
-    """The delay (ms) of the highest curve, searched in coarse steps and then in fine ones."""
+    """The delay (ms) of the highest curve, searched in coarse steps and then in fine ones.
+
+    It is not told where the top is so close to the largest delays that it may lie beyond them.
+    """
     delays = _coarse(largest)
     curves = curve(delays)
     best = int(delays[curves.sum(1).argmax()])
@@ -442,7 +445,9 @@ def _delay(curve: Callable[[np.ndarray], np.ndarray], largest: int) -> Estimate:
     around = np.setdiff1d(around[np.abs(around) <= largest], delays)
     curves, delays = np.concatenate([curves, curve(around)]), np.append(delays, around)
     order = np.argsort(delays)
-    return _estimate(delays[order] / MILLISECOND, curves[order], FINE_REACH / MILLISECOND, LARGEST_DELAY_ERROR)
+    found = _estimate(delays[order] / MILLISECOND, curves[order], FINE_REACH / MILLISECOND, LARGEST_DELAY_ERROR)
+    within = MILLISECOND * abs(found.value) <= largest - FINE_REACH
+    return replace(found, is_told=found.is_told and within)
 
 
 def _other_lens(

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaking
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.inspection import agreement as agreement_module
 from enerf_ns.dataparsers.inspection.agreement import Agreement
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -68,6 +69,19 @@ def agreement(recording: EventRecording) -> Agreement:
 
 def words(found: Agreement) -> str:
     return " ".join(problem.what + " " + problem.advice for problem in found.problems())
+
+
+@pytest.mark.parametrize("top, is_told", [(0, True), (30, True), (-44, True), (-48, False), (49, False), (-200, False)])
+def test_a_delay_that_may_lie_beyond_those_that_are_tried_is_not_told(top: float, is_told: bool):
+    """As of a camera that slides evenly, whose events grow ever sharper towards one end, but for noise."""
+
+    def curve(delays: np.ndarray) -> np.ndarray:
+        noise = np.array([np.random.default_rng(abs(int(delay))).normal(size=100) for delay in delays])
+        return 1.0 - 1e-5 * (1e-6 * delays[:, None] - top) ** 2 + 1e-6 * noise
+
+    found = agreement_module._delay(curve, 50_000_000)
+    assert found.is_told == is_told
+    assert not is_told or found.value == pytest.approx(top, abs=0.5)
 
 
 @pytest.mark.parametrize("late", [0, 5, -23])
