@@ -14,13 +14,16 @@ os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+    parser.addoption("--exhaustive", action="store_true", help="run all tests, sweeps in full too")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if not config.getoption("--slow"):
-        for item in items:
-            if "slow" in item.keywords:
-                item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+    exhaustive = config.getoption("--exhaustive")
+    for item in items:
+        if "exhaustive" in item.keywords and not exhaustive:
+            item.add_marker(pytest.mark.skip(reason="a sweep in full: run with --exhaustive"))
+        elif "slow" in item.keywords and not (exhaustive or config.getoption("--slow")):
+            item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -40,10 +40,11 @@ def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[
 
 
 @pytest.mark.timeout(2400)
-def test_nothing_is_lost_or_half_written_where_processes_are_killed(recording: Path, tmp_path: Path):
-    """Each at 50 random moments, spread over the whole time that it takes. The next start works, what was left is gone
+@pytest.mark.parametrize("kills", [8, pytest.param(50, marks=pytest.mark.exhaustive)])
+def test_nothing_is_lost_or_half_written_where_processes_are_killed(recording: Path, tmp_path: Path, kills: int):
+    """Each at random moments, spread over the whole time that it takes. The next start works, what was left is gone
     then, and a run that goes on ends with the weights of one that was never killed."""
-    assert broken_off("kill", recording, tmp_path, 50) == dict.fromkeys(KINDS, 50)
+    assert broken_off("kill", recording, tmp_path, kills) == dict.fromkeys(KINDS, kills)
 
 
 def test_files_that_cannot_grow_leave_nothing_half_written(recording: Path, tmp_path: Path):

@@ -798,7 +798,7 @@ def test_damaged(template: Template, data: st.DataObject):
     check_damaged(template, data.draw)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @settings(FUZZ, max_examples=200)
 @given(data=st.data())
 def test_damaged_in_many_ways(template: Template, data: st.DataObject):
