@@ -29,7 +29,8 @@ def read_config(path: Path) -> TrainerConfig:
         path: Its config.yml.
 
     Raises:
-        RecordingError: The file is missing, cannot be read, or is of no run, or of an earlier version.
+        RecordingError: The file is missing, cannot be read, is of no run, or names classes that are not installed, as
+            of an earlier version.
     """
     with reading(path, "the config.yml of a run"):
         text = path.read_text()
@@ -37,8 +38,8 @@ def read_config(path: Path) -> TrainerConfig:
             config = yaml.load(text, Loader=yaml.Loader)  # as Nerfstudio reads it
         except yaml.constructor.ConstructorError as error:
             raise RecordingError(
-                f"{path} was written by another version of the software ({error.problem}); edit it as docs/training.md "
-                "shows under “Runs of earlier versions”, or train anew."
+                f"{path} names what is not installed ({error.problem}); install the package of its method, or, if an "
+                "earlier version of this one wrote it, edit it as docs/training.md shows (“Runs of earlier versions”)."
             ) from error
     if not isinstance(config, TrainerConfig):
         raise RecordingError(f"{path} is not the config.yml of a run; give the folder of a run.")

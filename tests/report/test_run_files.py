@@ -120,7 +120,7 @@ def test_what_is_no_run_is_one_sentence(tmp_path: Path, copy_run: CopyRun):
         (b"", "is not the config.yml of a run"),
         (b"a: 1", "is not the config.yml of a run"),
         (b"\xff\x00", "cannot be read as the config.yml of a run"),
-        (b"!!python/object:nowhere.Nothing {}", "was written by another version of the software"),
+        (b"!!python/object:nowhere.Nothing {}", r"names what is not installed \(cannot find module 'nowhere'"),
     ):
         (tmp_path / "config.yml").write_bytes(content)
         with pytest.raises(RecordingError, match=words) as caught:
