@@ -253,7 +253,7 @@ def _made_of(density: HashDensity) -> Geometry:
     levels = density.grid.table.detach().numpy().reshape(len(scalings), -1, 2)
     size, init_density = density.aabb[1].numpy() - low, np.float32(density.init_density)
     return Geometry(
-        levels, scalings, layers_of(density.network), init_density, low, size, density.contraction is not None
+        levels, scalings, layers_of(density.network.parameters()), init_density, low, size, density.contraction is not None
     )
 
 
@@ -292,7 +292,7 @@ def render(
         num_samples = sampler.num_nerf_samples_per_ray
     else:
         num_samples = sampler.num_samples
-    what, colour = _made_of(field.geometry), layers_of(field.colour_network)
+    what, colour = _made_of(field.geometry), layers_of(field.colour_network.parameters())
     activation = ACTIVATIONS.index(field.brightness)
 
     def task(index: int) -> None:
