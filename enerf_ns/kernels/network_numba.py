@@ -211,7 +211,7 @@ def _backward(layers, x, grad_output, first, last, grad_x, grad_weights, grad_bi
 
 
 class _Network(torch.autograd.Function):
-    """Maps inputs of shape (in, points), and weight and bias of each layer in turn, to outputs of shape (out, points)."""
+    """Maps inputs, shape (in, points), and weight and bias of each layer in turn to outputs, shape (out, points)."""
 
     @staticmethod
     def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
