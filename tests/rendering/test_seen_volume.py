@@ -1,4 +1,4 @@
-"""What was seen, and where events came from: against a slow loop, and before a wall."""
+"""Seen voxels and the places of events, against slow loops and in front of a wall."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WALL = 0.3
 
 
 class WallModel:
-    """An endless wall at y = 0.3 of the scene, which all rays hit that look its way."""
+    """A model of an infinite wall at y = 0.3 of the scene. All rays that look towards it hit it."""
 
     def __init__(self, aabb: torch.Tensor, collider: Any):
         self.scene_box, self.collider, self.training = SceneBox(aabb), collider, True
