@@ -1,4 +1,4 @@
-"""The hash grid for other methods of Nerfstudio."""
+"""The fast hash grid for other methods of Nerfstudio."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from enerf_ns.kernels.hash_grid import fitting
 
 
 class FastHashEncoding(HashEncoding):
-    """Nerfstudio's HashEncoding in plain PyTorch, computed by the fastest backend that fits. Parameters, values and
-    checkpoints are the same."""
+    """Nerfstudio's HashEncoding with `implementation="torch"`, computed by the backend that "auto" selects.
+
+    Parameters, values and checkpoints are the same.
+    """
 
     def pytorch_fwd(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs encoding"]:
-        """Encodes positions in [0, 1]."""
+        """Returns the encoding of positions in [0, 1]."""
         if self.scalings.device != in_tensor.device:
             self.scalings = self.scalings.to(in_tensor.device)
         return fitting("auto", in_tensor, self.hash_table)(in_tensor, self.hash_table, self.scalings)
 
 
 def speed_up_hash_grids(module: nn.Module) -> int:
-    """Has every HashEncoding in plain PyTorch within a module be a `FastHashEncoding`, where it stands.
+    """Turns every HashEncoding with `implementation="torch"` inside a module into a `FastHashEncoding`, in place.
 
     Args:
-        module: Any module, such as the model of a Nerfstudio method. Encodings by tiny-cuda-nn stay as they are.
+        module: Any module, such as the model of a Nerfstudio method. Encodings of tiny-cuda-nn are left unchanged.
 
     Returns:
-        How many there were.
+        The number of encodings that were changed.
     """
     found = [part for part in module.modules() if type(part) is HashEncoding and part.tcnn_encoding is None]
     for encoding in found:

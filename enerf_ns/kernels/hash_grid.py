@@ -1,7 +1,8 @@
 """Multiresolution hash grid (Müller et al., Instant Neural Graphics Primitives, SIGGRAPH 2022, section 3).
 
-One layout of parameters, and backends that compute the same function: `hash_grid` below in plain PyTorch, which runs on
-any device and is the test oracle, and those of `BACKENDS`, compiled on first use, for the CPU and for the GPU.
+All backends have one layout of parameters and compute the same function. The function `hash_grid` of this module is in
+plain PyTorch. It runs on any device, and tests compare the other backends with it. Those are in `BACKENDS`, for the CPU
+and for the GPU, and are compiled on first use.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from torch import Tensor, nn
 def hash_grid(
     x: Float[Tensor, "*batch 3"], table: Float[Tensor, "entries features"], scalings: Float[Tensor, " levels"]
 ) -> Float[Tensor, "*batch encoding"]:
-    """Trilinear interpolation of hashed features at every level (equations 2 to 4 of the paper), in plain PyTorch.
+    """Returns hashed features, interpolated trilinearly at every level (equations 2 to 4 of the paper).
 
-    Every level is hashed, also those whose lattice would fit the table, as in Nerfstudio's PyTorch HashEncoding.
-    Differentiable in `x` and `table`. On a plane of a level's lattice the encoding has a kink; the derivative across
-    the plane that is returned for that level is zero, as in Nerfstudio.
+    As in Nerfstudio's HashEncoding in PyTorch, every level is hashed, even a level whose lattice fits into the table.
+    The result is differentiable in `x` and `table`. On a plane of a level's lattice the encoding has a kink. There the
+    derivative across the plane is zero for this level, as in Nerfstudio.
 
     Args:
-        x: positions, meant for [0, 1]; the lattice goes on outside of it.
+        x: Positions in [0, 1]. Outside this range the lattice continues.
         table: levels * T rows, level after level; T is a power of two.
-        scalings: lattice cells a unit length, for each level; whole numbers.
+        scalings: Lattice cells per unit length, for each level; whole numbers.
 
     Returns:
-        levels * features numbers a position, level after level.
+        levels * features numbers for each position, level after level.
     """
     num_levels, features_per_level = len(scalings), table.shape[1]
     table_size = len(table) // num_levels
@@ -48,7 +49,7 @@ def hash_grid(
     encoding = torch.zeros((), device=x.device)
     for i, j, k in itertools.product((0, 1), repeat=3):
         rows = ((hashes[i, ..., 0] ^ hashes[j, ..., 1] ^ hashes[k, ..., 2]) & (table_size - 1)) + offsets
-        # of PyTorch's ways to look up rows, the one with the fastest backward pass on the CPU
+        # gather has the fastest backward pass on the CPU of all ways to look up rows in PyTorch
         features = table.gather(0, rows.reshape(-1, 1).expand(-1, features_per_level))
         weight = weights[i, ..., 0] * weights[j, ..., 1] * weights[k, ..., 2]
         encoding = encoding + weight[..., None] * features.view(*rows.shape, features_per_level)
@@ -68,17 +69,22 @@ class Backend:
     """One way to compute the hash grid."""
 
     package: str
-    """What it is compiled with, which may be missing."""
+    """The package that compiles it. It may not be installed."""
     module: str
-    """Module of its function `hash_grid`, and of DEVICE, the type of the device whose tensors that takes."""
+    """The module with the function `hash_grid`, and with DEVICE, the type of device whose tensors it takes."""
     device: str
-    """Type of the device on which "auto" takes it; elsewhere its module is not even imported."""
+    """The type of device on which "auto" selects this backend. On other devices its module is not even imported."""
     features: tuple[int, ...]
-    """Features per level that it knows."""
+    """Numbers of features per level that it can compute."""
 
     def misfit(self, device: str, dtype: torch.dtype = torch.float32, num_features: int = 2) -> str | None:
-        """What it needs that positions and a table of this device, type and features per level are not; None where it
-        can take them."""
+        """Returns what the backend needs and does not find, in words, or None if it can compute.
+
+        Args:
+            device: Type of the device of the positions and the table.
+            dtype: Type of the positions and the table.
+            num_features: Features per level.
+        """
         module = _module(self.module)
         if module is None:
             return f"the package {self.package}, which cannot be imported"
@@ -93,19 +99,20 @@ BACKENDS: dict[str, Backend] = {
     "triton": Backend("triton", "enerf_ns.kernels.hash_grid_triton", "cuda", (1, 2, 4, 8)),
     "numba": Backend("numba", "enerf_ns.kernels.hash_grid_numba", "cpu", (2,)),
 }
-"""Backends by name, beside "torch", which is `hash_grid` and fits everything."""
+"""Backends by name. The backend "torch" is the function `hash_grid` of this module, which takes any tensors."""
 
 
 def backend_of(name: str, x: Tensor, table: Tensor) -> str:
-    """The name of the backend that computes the grid for some positions and a table.
+    """Returns the name of the backend that computes the hash grid for these positions and this table.
 
     Args:
-        name: "torch", one of `BACKENDS`, or "auto": of these the first that fits, else "torch".
-        x: positions, shape `(*batch, 3)`.
-        table: rows, shape (levels * T, features).
+        name: "torch", a name in `BACKENDS`, or "auto", which selects the first of `BACKENDS` that can compute, or else
+            "torch".
+        x: Positions, shape (*batch, 3).
+        table: Rows, shape (levels * T, features).
 
     Raises:
-        ValueError: There is no backend of this name, or it does not fit.
+        ValueError: No backend has this name, or the backend cannot compute for these tensors.
     """
     if name not in ("auto", "torch", *BACKENDS):
         raise ValueError(f'backend is "{name}", but must be auto, torch, {" or ".join(BACKENDS)}')
@@ -121,27 +128,26 @@ def backend_of(name: str, x: Tensor, table: Tensor) -> str:
 
 
 def fitting(name: str, x: Tensor, table: Tensor) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function of the backend of `backend_of`."""
+    """Returns the function `hash_grid` of the backend that `backend_of` selects, with the same arguments and errors."""
     found = backend_of(name, x, table)
     return hash_grid if found == "torch" else importlib.import_module(BACKENDS[found].module).hash_grid
 
 
 class HashGrid(nn.Module):
-    """Encoding of positions by a multiresolution hash grid; the same function, and the same table row by row, as
-    Nerfstudio 1.1.5's `HashEncoding(implementation="torch")`.
+    """The encoding of positions by a multiresolution hash grid.
 
-    The backend is chosen at each call, and the checkpoint holds nothing but `table`: what one backend has trained, the
-    other one loads.
+    The function, and the table row by row, are those of `HashEncoding(implementation="torch")` in Nerfstudio 1.1.5. The
+    backend is selected at each call. A checkpoint holds only `table`, so any backend can load it.
 
     Args:
-        num_levels: number of levels, at least 1.
-        min_res: lattice cells along each side of the unit cube at the coarsest level.
-        max_res: lattice cells along each side of the unit cube at the finest level; the levels between are in
+        num_levels: Number of levels, at least 1.
+        min_res: Lattice cells along each side of the unit cube at the coarsest level.
+        max_res: Lattice cells along each side of the unit cube at the finest level. The levels between them follow a
             geometric progression, rounded down.
-        log2_table_size: each level has 2**log2_table_size rows.
-        features_per_level: numbers in one row.
-        init_scale: the table starts uniform in [-init_scale, init_scale).
-        backend: as of `backend_of`; chosen at each call.
+        log2_table_size: Each level has 2**log2_table_size rows.
+        features_per_level: Numbers in one row.
+        init_scale: The table starts uniform in [-init_scale, init_scale).
+        backend: "auto", "torch" or a name in `BACKENDS`; see `backend_of`.
     """
 
     scalings: Tensor
@@ -160,16 +166,16 @@ class HashGrid(nn.Module):
         self.backend = backend
         self.out_dim = num_levels * features_per_level
         growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
-        scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as Nerfstudio does
+        scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as in Nerfstudio
         self.register_buffer("scalings", scalings, persistent=False)
         table = torch.rand(num_levels * 2**log2_table_size, features_per_level) * 2 - 1
         self.table = nn.Parameter(table * init_scale)
 
     def forward(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch out_dim"]:
-        """Encodes positions in [0, 1]; slightly outside, the lattice goes on.
+        """Returns the encoding of positions in [0, 1]. Outside this range the lattice continues.
 
         Raises:
-            ValueError: if the last axis of `x` is not 3, or if there is no such backend, or it does not fit.
+            ValueError: The last axis of `x` is not 3, no backend has this name, or the backend cannot compute.
         """
         if x.shape[-1] != 3:
             raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")

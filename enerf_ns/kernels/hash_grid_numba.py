@@ -1,10 +1,9 @@
-"""The hash grid on the CPU: Numba kernels for float32 and two features per level, one level a task.
+"""The hash grid on the CPU: Numba kernels for float32 and two features per level.
 
-A level is one thread's: while it works there, the level's rows stay in its cache, and gradients need no atomics and add
-up in the same order whatever the number of threads. Positions go through in blocks, whose corners are found by vector
-instructions before the first row is fetched. The kernels release the GIL and run on plain Python threads
-(`enerf_ns.kernels.threads`), so that no threading layer of Numba has to get along with OpenMP, forks and the viewer's
-threads.
+One thread computes one level at a time, so that the rows of the level stay in its cache. Gradients need no atomic
+additions, and their sums have the same order with any number of threads. Positions are processed in blocks: vector
+instructions find the corners of all cells of a block before the first row is read. The kernels release the GIL and run
+on Python threads (`enerf_ns.kernels.threads`): so no threads of Numba have to work beside OpenMP, forks and the viewer.
 """
 
 from __future__ import annotations
@@ -21,29 +20,33 @@ DEVICE = "cpu"
 """Type of the device whose tensors the kernels take."""
 
 BLOCK = 128
-"""Positions whose corners are found together: few enough for the fastest cache."""
+"""Number of positions in a block: few enough for the fastest cache."""
 
 
 @compiled
 def new_cells():
-    """Room for the cells of a block: for each of the 4 edges along x of a cell the hash of y and z; the hash of either
-    end in x; and the way across the cell along the three axes, as a share."""
+    """Returns empty arrays for the cells of a block.
+
+    The first holds the hash of y and z for the 4 edges of a cell along x, the second the hash of x for both ends of
+    these edges, the third the position within the cell along the three axes, from 0 to 1.
+    """
     return np.empty((4, BLOCK), np.uint32), np.empty((2, BLOCK), np.uint32), np.empty((3, BLOCK), np.float32)
 
 
 @compiled
 def find_cells(x, first, number, scaling, cells):
-    """Writes the cells of so many of the positions x, shape (3, positions) in [0, 1], from the first one on.
+    """Writes the cells of positions to cells.
 
     Args:
-        x, first, number: The positions; `BLOCK` of them at most.
-        scaling: Lattice cells a unit length.
-        cells: As of `new_cells`.
+        x: Positions in [0, 1], shape (3, positions).
+        first, number: The positions from `first` to `first + number - 1`, at most `BLOCK`, are processed.
+        scaling: Lattice cells per unit length.
+        cells: Arrays of `new_cells`.
     """
-    edges, ends, ways = cells
-    # rows are of the low bits of a hash, so that 32 bits, which wrap around, do
+    edges, ends, fractions = cells
+    # only the low bits of a hash select the row, so 32-bit arithmetic that wraps around is enough
     prime1, prime2 = np.uint32(2654435761), np.uint32(805459861)
-    # rows are cut, since where an index might be negative, Numba looks at each, and nothing is vectorised
+    # rows are cut: Numba checks an index that might be negative, and such a loop is not vectorised
     along0, along1, along2 = x[0][first : first + number], x[1][first : first + number], x[2][first : first + number]
     for p in range(number):
         x0, x1, x2 = along0[p] * scaling, along1[p] * scaling, along2[p] * scaling
@@ -56,14 +59,15 @@ def find_cells(x, first, number, scaling, cells):
         z_low, z_high = np.uint32(np.uint32(low2) * prime2), np.uint32(np.uint32(high2) * prime2)
         edges[0, p], edges[1, p] = y_low ^ z_low, y_low ^ z_high
         edges[2, p], edges[3, p] = y_high ^ z_low, y_high ^ z_high
-        ways[0, p], ways[1, p], ways[2, p] = w0, w1, w2
+        fractions[0, p], fractions[1, p], fractions[2, p] = w0, w1, w2
 
 
 @compiled
 def _corners(cells, p):
-    """Of position p of a block: its cell's edges, as hash and weight; either end's hash; weights along the axes."""
-    edges, ends, ways = cells
-    w0, w1, w2 = ways[0, p], ways[1, p], ways[2, p]
+    """Returns for position p of a block: hash and weight of the 4 edges along x of its cell, the hashes of the two ends
+    of these edges, and the weights of the lower and the upper side along each axis."""
+    edges, ends, fractions = cells
+    w0, w1, w2 = fractions[0, p], fractions[1, p], fractions[2, p]
     v0, v1, v2 = np.float32(1) - w0, np.float32(1) - w1, np.float32(1) - w2
     weighted = (
         (edges[0, p], v1 * v2),
@@ -76,12 +80,14 @@ def _corners(cells, p):
 
 @compiled
 def interpolate(cells, number, table, encoding, first):
-    """Writes the two features of a block's positions to encoding.
+    """Writes the two interpolated features of the positions of a block to encoding.
 
     Args:
-        cells, number: Of the positions, as of `find_cells`.
+        cells: The cells of the positions, from `find_cells`.
+        number: Number of positions.
         table: Rows of one level, shape (T, 2); T is a power of two.
-        encoding, first: Shape (2, positions), written from this column on.
+        encoding: Shape (2, positions).
+        first: First column of encoding that is written.
     """
     mask = np.uint32(len(table) - 1)
     encoding0, encoding1 = encoding[0][first : first + number], encoding[1][first : first + number]
@@ -138,7 +144,7 @@ def _backward_x(x, grad_encoding, scaling, table, grad_x):
             edges, (low, high), (v0, w0), (v1, w1), (v2, w2) = _corners(cells, p)
             grad0, grad1 = grads0[p], grads1[p]
             along0 = np.float32(0)
-            values = (np.float32(0), np.float32(0), np.float32(0), np.float32(0))  # of the last 4 edges
+            values = (np.float32(0), np.float32(0), np.float32(0), np.float32(0))  # at the last 4 edges
             for edge, weight in edges:
                 a, b = (low ^ edge) & mask, (high ^ edge) & mask
                 value_a = grad0 * table[a, 0] + grad1 * table[a, 1]
@@ -151,13 +157,13 @@ def _backward_x(x, grad_encoding, scaling, table, grad_x):
 
 
 def _read_into_cache(table: np.ndarray, num_positions: int) -> None:
-    # Reading a level in the order of memory takes a fraction of fetching the same rows one by one at random.
+    # reading a level in the order of memory is several times faster than reading the same rows in random order
     if 8 * num_positions >= len(table):
         table.max()
 
 
 class _HashGrid(torch.autograd.Function):
-    """Positions of shape (3, positions) in, encoding of shape (2 * levels, positions) out."""
+    """Maps positions of shape (3, positions) to the encoding of shape (2 * levels, positions)."""
 
     @staticmethod
     def forward(ctx, x: Tensor, table: Tensor, scalings: Tensor) -> Tensor:
@@ -195,7 +201,7 @@ class _HashGrid(torch.autograd.Function):
             on_threads(task_x, num_levels)
             grad_x = grad_x_by_level.sum(dim=0)
         if ctx.needs_input_grad[1]:
-            # NumPy asks Linux for huge pages, PyTorch does not: page faults would take as long as the kernels.
+            # NumPy requests huge pages from Linux. PyTorch does not, and page faults would take as long as the kernels.
             grad_rows = np.empty((num_levels, len(table) // num_levels, 2), np.float32)
 
             def task_table(level: int) -> None:
@@ -207,7 +213,9 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(x: Tensor, table: Tensor, scalings: Tensor) -> Tensor:
-    """Trilinear interpolation of hashed features at every level, for float32 tensors on the CPU and two features per
-    level; differentiable once in `x` and `table`. Else as `enerf_ns.kernels.hash_grid.hash_grid`."""
+    """Returns the function `enerf_ns.kernels.hash_grid.hash_grid` of float32 tensors on the CPU.
+
+    The table has two features per level. The result is differentiable once in `x` and `table`.
+    """
     encoding = _HashGrid.apply(x.reshape(-1, 3).t().contiguous(), table.contiguous(), scalings)
     return encoding.t().reshape(*x.shape[:-1], len(encoding))

@@ -1,13 +1,13 @@
 """The hash grid on the GPU: Triton kernels for float32 and 1, 2, 4 or 8 features per level.
 
-Triton comes with PyTorch, and compiles the kernels when they are first called. Nothing of the forward pass is kept but
-positions and table. Gradients of the table are summed by atomic additions, whose order, and so whose last bits, change
-from call to call. With TRITON_INTERPRET=1 in the environment before Triton is imported, the kernels run on CPU tensors,
-as NumPy, which is for tests.
+Triton comes with PyTorch, and compiles the kernels when they are first called. For the backward pass only positions,
+table and scalings are kept. Atomic additions sum the gradients of the table. Their order changes from call to call, and
+so do the last bits of the sums. If TRITON_INTERPRET=1 is in the environment before Triton is imported, NumPy executes
+the kernels on CPU tensors. Tests do so.
 """
 
-# Triton reads annotations such as tl.constexpr where they stand: no postponed ones here. Kernels are called with
-# tensors where they take pointers, and with numbers where they take tl.constexpr:
+# Triton needs evaluated annotations such as tl.constexpr, so annotations are not postponed in this module. Callers pass
+# tensors for pointers, and numbers for tl.constexpr:
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import torch
@@ -21,19 +21,21 @@ DEVICE = "cpu" if knobs.runtime.interpret else "cuda"
 """Type of the device whose tensors the kernels take."""
 
 BLOCK = 1024 if knobs.runtime.interpret else 128
-"""Positions of a program; the interpreter takes as long for few as for many."""
+"""Number of positions of one program. The interpreter is slow per program, so its programs are large."""
 
 
 @triton.jit
 def _cell(x, positions, inside, scaling):
-    """Lattice points below and above each position, hashed, and the way from the former, along the three axes."""
+    """Returns for each axis the hashes of the lattice points below and above each position, and the distance from the
+    lower one in cells."""
     x0 = tl.load(x + 3 * positions, mask=inside, other=0.0) * scaling
     x1 = tl.load(x + 3 * positions + 1, mask=inside, other=0.0) * scaling
     x2 = tl.load(x + 3 * positions + 2, mask=inside, other=0.0) * scaling
     floor0, floor1, floor2 = tl.floor(x0), tl.floor(x1), tl.floor(x2)
     w0, w1, w2 = x0 - floor0, x1 - floor1, x2 - floor2
     low0, low1, low2 = floor0.to(tl.int32), floor1.to(tl.int32), floor2.to(tl.int32)
-    # rows are of the low bits of a hash, so that 32 bits, which wrap around, do: -1640531535 is 2654435761 there
+    # only the low bits of a hash select the row, so 32-bit arithmetic that wraps around is enough; in it -1640531535 is
+    # 2654435761
     high0 = low0 + (w0 > 0).to(tl.int32)
     high1 = (low1 + (w1 > 0).to(tl.int32)) * -1640531535
     high2 = (low2 + (w2 > 0).to(tl.int32)) * 805459861
@@ -42,7 +44,7 @@ def _cell(x, positions, inside, scaling):
 
 @triton.jit
 def _corner(corner: tl.constexpr, low0, high0, w0, low1, high1, w1, low2, high2, w2, table_size):
-    """Rows of one of the corners of cells, of 0 to 7, among those of a level, and its weights along the three axes."""
+    """Returns the row within a level of one corner, from 0 to 7, of each cell, and its weights along the three axes."""
     hash0, weight0 = (high0, w0) if corner & 1 else (low0, 1.0 - w0)
     hash1, weight1 = (high1, w1) if corner & 2 else (low1, 1.0 - w1)
     hash2, weight2 = (high2, w2) if corner & 4 else (low2, 1.0 - w2)
@@ -186,7 +188,9 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(x: Tensor, table: Tensor, scalings: Tensor) -> Tensor:
-    """Trilinear interpolation of hashed features at every level, for float32 tensors on a GPU and 1, 2, 4 or 8 features
-    per level; differentiable once in `x` and `table`. Else as `enerf_ns.kernels.hash_grid.hash_grid`."""
+    """Returns the function `enerf_ns.kernels.hash_grid.hash_grid` of float32 tensors on a GPU.
+
+    The table has 1, 2, 4 or 8 features per level. The result is differentiable once in `x` and `table`.
+    """
     encoding = _HashGrid.apply(x.reshape(-1, 3).contiguous(), table.contiguous(), scalings)
     return encoding.reshape(*x.shape[:-1], encoding.shape[-1])

@@ -1,4 +1,4 @@
-"""Small networks, in PyTorch or compiled for the CPU."""
+"""Small networks, computed by PyTorch or by compiled kernels for the CPU."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from enerf_ns.kernels.hash_grid import BACKENDS
 
 
 class Network(MLP):
-    """Nerfstudio's network in PyTorch with ReLU between its layers: the same function of the same parameters, on the
-    CPU by compiled kernels.
+    """Nerfstudio's multilayer perceptron with ReLU between its layers. Compiled kernels compute it on the CPU.
+
+    The parameters and the function are those of Nerfstudio's class.
 
     Args:
         in_dim: Width of the inputs.
-        num_layers: At least 1.
+        num_layers: Number of linear layers, at least 1.
         layer_width: Width of the hidden layers.
         out_dim: Width of the output.
-        backend: As of the `HashGrid` beside it: with "auto" and "numba" the kernels are used where they can be, which
-            is in float32.
+        backend: The backend of the hash grid beside the network. With "auto" and "numba" the kernels compute float32
+            on the CPU; in all other cases PyTorch computes.
     """
 
     def __init__(self, in_dim: int, num_layers: int, layer_width: int, out_dim: int, backend: str = "auto"):
@@ -28,16 +29,11 @@ class Network(MLP):
         self.backend = backend
 
     def forward(self, in_tensor: Float[Tensor, "*batch in_dim"]) -> Float[Tensor, "*batch out_dim"]:
-        kernels = BACKENDS["numba"]
-        misfit = kernels.misfit(in_tensor.device.type, in_tensor.dtype)
+        """Returns the output of the network."""
+        misfit = BACKENDS["numba"].misfit(in_tensor.device.type, in_tensor.dtype)
         if self.backend not in ("auto", "numba") or misfit or torch.is_autocast_enabled("cpu"):
             return super().forward(in_tensor)
         from enerf_ns.kernels.network_numba import network  # here, since Numba may be missing
 
-        layers = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
-        found = network(
-            in_tensor.reshape(-1, in_tensor.shape[-1]),
-            [layer.weight for layer in layers],
-            [layer.bias for layer in layers],
-        )
+        found = network(in_tensor.reshape(-1, in_tensor.shape[-1]), self.parameters())
         return found.view(*in_tensor.shape[:-1], found.shape[-1])

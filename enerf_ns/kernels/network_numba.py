@@ -1,18 +1,19 @@
-"""Small networks on the CPU: some points at a time go through all layers while all of it is in the fastest cache.
+"""Compiled kernels for small networks on the CPU.
 
-Nothing is kept for the backward pass but the inputs; what the layers made of them is computed again. PyTorch, layer by
-layer, writes and reads every number on the way, and its threads spin where others wait.
+A block of points goes through all layers while its values stay in the fastest cache. PyTorch computes layer by layer,
+writes and reads every value in memory, and its threads spin while other threads wait. For the backward pass the kernels
+keep only the inputs, and compute the values of the layers again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from nerfstudio.field_components.mlp import MLP
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from enerf_ns.dataparsers.compiled import compiled
@@ -20,8 +21,8 @@ from enerf_ns.kernels.hash_grid_numba import BLOCK
 from enerf_ns.kernels.threads import on_threads
 
 TASK = 16 * BLOCK
-"""Points that a thread takes at a time. Gradients are summed within a task and then task after task, so that they do
-not depend on the number of threads."""
+"""Number of points that a thread takes at a time. Gradients are summed within a task, and then over the tasks in order.
+So they do not depend on the number of threads."""
 
 ZERO = np.float32(0)
 
@@ -29,24 +30,25 @@ vectorised = partial(compiled, any_order=True)
 
 
 class Layers(NamedTuple):
-    """A network with ReLU between its layers: weights, each of shape (out, in), and biases."""
+    """The layers of a network with ReLU between them: weights of shape (out, in), and biases of shape (out)."""
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
 
 
-def layers_of(network: MLP) -> Layers:
-    """The layers of one of Nerfstudio's networks in PyTorch, without gradients; they share its memory."""
-    layers = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
-    return Layers(
-        tuple(layer.weight.detach().numpy() for layer in layers),
-        tuple(layer.bias.detach().numpy() for layer in layers),
-    )
+def layers_of(parameters: Iterable[Tensor]) -> Layers:
+    """Returns the layers of a network, without gradients; arrays share the memory of contiguous parameters.
+
+    Args:
+        parameters: Weight and bias of the first layer, of the second layer, and so on.
+    """
+    arrays = tuple(parameter.detach().contiguous().numpy() for parameter in parameters)
+    return Layers(arrays[::2], arrays[1::2])
 
 
 @vectorised
 def _add_product(weight, inputs, number, outputs):
-    """outputs += weight @ inputs, for so many columns; in blocks of four by four, to read each number seldom."""
+    """Adds weight @ inputs to outputs, for the first columns. Blocks of four by four make reads from memory rare."""
     rows, width = weight.shape
     by_four, rows_by_four = width // 4 * 4, rows // 4 * 4
     for j in range(0, rows_by_four, 4):
@@ -84,7 +86,7 @@ def _add_product(weight, inputs, number, outputs):
 
 @vectorised
 def _add_outer(grads, inputs, number, grad_weight):
-    """grad_weight += grads @ inputs.T, over so many columns; in blocks of two by four."""
+    """Adds grads @ inputs.T, over the first columns, to grad_weight; in blocks of two by four."""
     rows, width = grad_weight.shape
     by_four, rows_by_two = width // 4 * 4, rows // 2 * 2
     for j in range(0, rows_by_two, 2):
@@ -119,7 +121,7 @@ def _add_outer(grads, inputs, number, grad_weight):
 
 @vectorised
 def new_values(layers):
-    """Room for a block's inputs, and for what each layer makes of them, shape (layers + 1, widest, BLOCK)."""
+    """Returns an empty array for the inputs and the outputs of all layers of a block: (layers + 1, widest, BLOCK)."""
     widest = layers.weights[0].shape[1]
     for i in range(len(layers.weights)):
         widest = max(widest, layers.weights[i].shape[0])
@@ -128,8 +130,16 @@ def new_values(layers):
 
 @vectorised
 def pass_through(layers, number, values, num_layers):
-    """What the last of the first layers makes of the inputs in values[0], of which there are so many; what the others
-    make stays in values, after ReLU but that of a network's last layer."""
+    """Computes the first layers of a network for the points in values[0], and returns the output of the last of them.
+
+    The output of layer i, counted from 0, is written to values[i + 1]. ReLU follows every layer but the network's last.
+
+    Args:
+        layers: The network.
+        number: Number of points, at most `BLOCK`.
+        values: An array of `new_values`.
+        num_layers: Number of layers that are computed.
+    """
     last = len(layers.weights) - 1
     for i in range(num_layers):
         outputs, bias = values[i + 1], layers.biases[i]
@@ -147,7 +157,7 @@ def pass_through(layers, number, values, num_layers):
 
 @vectorised
 def _read(array, start, number, values):
-    # rows are cut, since where an index might be negative, Numba looks at each, and nothing is vectorised
+    # Rows are cut: Numba checks an index that might be negative, and such a loop is not vectorised.
     for j in range(len(array)):
         row = array[j][start : start + number]
         for p in range(number):
@@ -201,12 +211,12 @@ def _backward(layers, x, grad_output, first, last, grad_x, grad_weights, grad_bi
 
 
 class _Network(torch.autograd.Function):
-    """Inputs of shape (in, points), then weights and biases of all layers; output of shape (out, points)."""
+    """Maps inputs, shape (in, points), and weight and bias of each layer in turn to outputs, shape (out, points)."""
 
     @staticmethod
     def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
         ctx.save_for_backward(x, *parameters)
-        layers, num_points, inputs = _as_layers(parameters), x.shape[1], x.numpy()
+        layers, num_points, inputs = layers_of(parameters), x.shape[1], x.numpy()
         output = torch.empty(len(layers.biases[-1]), num_points)
         outputs = output.numpy()
 
@@ -220,7 +230,7 @@ class _Network(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_output: Tensor) -> tuple[Tensor, ...]:
         x, *parameters = ctx.saved_tensors
-        layers, num_points, inputs = _as_layers(parameters), x.shape[1], x.numpy()
+        layers, num_points, inputs = layers_of(parameters), x.shape[1], x.numpy()
         grad_outputs, grad_x = grad_output.contiguous().numpy(), torch.empty_like(x)
         num_tasks = -(-num_points // TASK)
         by_task = [torch.zeros(num_tasks, *parameter.shape) for parameter in parameters]
@@ -228,27 +238,21 @@ class _Network(torch.autograd.Function):
 
         def task(index: int) -> None:
             mine = tuple(found[index] for found in grads)
-            weights, biases = mine[: len(mine) // 2], mine[len(mine) // 2 :]
             first, last = TASK * index, min(TASK * (index + 1), num_points)
-            _backward(layers, inputs, grad_outputs, first, last, grad_inputs, weights, biases)
+            _backward(layers, inputs, grad_outputs, first, last, grad_inputs, mine[::2], mine[1::2])
 
         on_threads(task, num_tasks)
         return (grad_x, *(found.sum(dim=0) for found in by_task))
 
 
-def _as_layers(parameters: tuple[Tensor, ...] | list[Tensor]) -> Layers:
-    arrays = tuple(parameter.detach().contiguous().numpy() for parameter in parameters)
-    return Layers(arrays[: len(arrays) // 2], arrays[len(arrays) // 2 :])
-
-
-def network(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
-    """Layers with ReLU between them, for float32 tensors on the CPU; differentiable once in all.
+def network(x: Tensor, parameters: Iterable[Tensor]) -> Tensor:
+    """The output of layers with ReLU between them, for float32 tensors on the CPU; differentiable once.
 
     Args:
-        x: Inputs, shape (points, in); fastest where it is the transpose of a contiguous tensor, as of a hash grid.
-        weights, biases: Of each layer, shapes (out, in) and (out).
+        x: Inputs, shape (points, in). The transpose of a contiguous tensor, such as a hash grid returns, is fastest.
+        parameters: Weight, shape (out, in), and bias, shape (out), of each layer in turn.
 
     Returns:
         Shape (points, out), the transpose of a contiguous tensor.
     """
-    return _Network.apply(x.t().contiguous(), *weights, *biases).t()
+    return _Network.apply(x.t().contiguous(), *parameters).t()

@@ -1,4 +1,4 @@
-"""Half precision where it does no harm: mixed precision is torch.autocast's, and this is what is kept out of it."""
+"""Keeps sensitive functions in float32 while torch.autocast computes the rest in half precision."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from torch import Tensor
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-HALF = (torch.float16, torch.bfloat16)
-"""Types of half precision."""
-
 
 def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Keeps a function out of torch.autocast, and gives it float32 for every tensor in half precision that it is given.
+    """Returns the function, computed without torch.autocast, with its arguments in half precision widened to float32.
 
-    On the demo after 600 steps, a density network in bfloat16 moves changes of log brightness by 0.7 % of their spread,
-    and by up to 0.029, in float16 by 0.08 %; what a young field has to tell is as small.
+    On the demo after 600 steps, a density network in bfloat16 changes differences of log brightness by 0.7 % of their
+    standard deviation, and by at most 0.029. In float16 it is 0.08 %. Early in training the differences that the field
+    has to learn are as small as that.
     """
 
     @functools.wraps(function)
@@ -34,5 +32,6 @@ def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments,
 
 
 def widened(value: Any) -> Any:
-    """Float32 of a tensor in half precision; anything else as it is."""
-    return value.float() if isinstance(value, Tensor) and value.dtype in HALF else value
+    """Returns a tensor in half precision as float32, and any other value unchanged."""
+    is_half = isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16)
+    return value.float() if is_half else value

@@ -1,8 +1,8 @@
-"""Threads of the compiled kernels, and of PyTorch beside them.
+"""Threads for the compiled kernels, and the number of threads of PyTorch.
 
-PyTorch's threads spin for milliseconds after each of their tasks, on the cores that the next task needs: that of a
-kernel, or of another process, which spins in turn. A training step leaves PyTorch one thread, and what takes long to
-the kernels, whose threads wait asleep.
+PyTorch's threads spin for milliseconds after each task. So they hold cores that the kernels, or another process, need.
+In a training step PyTorch therefore has one thread. The kernels do the long work, and their threads sleep while they
+wait.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any
 
 import torch
 
-_of_kernels: int | None = None  # where they are not as many as PyTorch's
+_of_kernels: int | None = None  # number of threads of the kernels within `kernels_alone`
 
 
 @contextmanager
 def kernels_alone() -> Iterator[None]:
-    """Leaves PyTorch one thread, and the kernels as many as it had."""
+    """Limits PyTorch to one thread inside the context, and gives the kernels as many threads as PyTorch had."""
     global _of_kernels
     before = torch.get_num_threads()
     if _of_kernels is not None or before == 1:
@@ -42,12 +42,18 @@ def _helpers(number: int) -> ThreadPoolExecutor:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process does not have the threads of its parent
 
 
 def on_threads(task: Callable[[int], Any], number: int) -> None:
-    """Calls a task that releases the GIL with 0, 1, … number - 1, on as many threads as PyTorch uses, or did before
-    `kernels_alone`; the calling thread is one of them."""
+    """Calls a task once with each index, on as many threads as PyTorch has, or had before `kernels_alone`.
+
+    The calling thread is one of these threads. An exception of a task is raised here.
+
+    Args:
+        task: A function of the index; it should release the GIL.
+        number: Indices go from 0 to number - 1.
+    """
     num_threads = min(_of_kernels or torch.get_num_threads(), number)
     indices = iter(range(number))
 

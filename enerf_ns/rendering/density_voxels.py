@@ -1,4 +1,4 @@
-"""A density known at the corners of voxels: where surfaces may be, in a few reads of memory instead of a network."""
+"""Density at the corners of voxels: a few reads of memory show where surfaces may be, in place of a network."""
 
 from __future__ import annotations
 
@@ -11,36 +11,39 @@ from torch import Tensor
 from enerf_ns.rendering.field import HashDensity
 
 VOXELS = 96
-"""Along the longest side of the space. A picture whose samples they place is as near to the integral along its rays as
-one whose samples the network places (`benchmarks/rendering.py`)."""
+"""Voxels along the longest side of the space. With samples placed by these voxels, a picture is as near to the integral
+along its rays as with samples placed by the network (`benchmarks/rendering.py`)."""
 
 AT_ONCE = 2**16
-"""Positions for which a network is asked at once."""
+"""Number of positions that the network computes at once."""
 
 
 class DensityVoxels:
-    """Densities of a network, which may learn on, linear within voxels. They are asked again when its parameters have
-    changed.
+    """Density of a network, interpolated linearly within voxels.
+
+    The network may continue to learn: the densities are computed again after its parameters have changed.
 
     Args:
-        network: Whose densities they are.
+        network: The network that gives the density at the corners.
     """
 
     def __init__(self, network: HashDensity):
         self._network = network
-        self._asked: tuple[list[Tensor], Tensor] | None = None
+        self._known: tuple[list[Tensor], Tensor] | None = None
 
     def values(self) -> Float[Tensor, "z y x"]:
-        """Densities in 1 / scene unit, at the corners of all voxels, the outer ones on the faces of the box, or of
-        contracted space; without gradients."""
+        """Returns the densities at the corners of all voxels, in 1 / scene unit, without gradients.
+
+        The outermost corners lie on the faces of the box, or of the contracted space.
+        """
         parameters = list(self._network.parameters())
-        # by value: PyTorch's fused optimizers do not count versions
-        if self._asked is None or not all(map(torch.equal, parameters, self._asked[0])):
-            self._asked = [parameter.detach().clone() for parameter in parameters], self._ask()
-        return self._asked[1]
+        # compared by value, since PyTorch's fused optimizers do not increase the version of a parameter
+        if self._known is None or not all(map(torch.equal, parameters, self._known[0])):
+            self._known = [parameter.detach().clone() for parameter in parameters], self._at_corners()
+        return self._known[1]
 
     @torch.no_grad()
-    def _ask(self) -> Tensor:
+    def _at_corners(self) -> Tensor:
         size = self._network.aabb[1] - self._network.aabb[0]
         if self._network.contraction is not None:
             size = torch.ones_like(size)
@@ -51,7 +54,7 @@ class DensityVoxels:
         return torch.cat(found).float().view(z, y, x)
 
     def __call__(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
-        """Density at positions in scene units; those outside the space have that of its faces."""
+        """Returns the density, in 1 / scene unit, at positions in scene units; beyond a face, that of the face."""
         unit = self._network.unit(positions).view(1, 1, 1, -1, 3)
         found = torch.nn.functional.grid_sample(
             self.values().to(unit)[None, None], 2.0 * unit - 1.0, padding_mode="border", align_corners=True

@@ -20,20 +20,20 @@ from enerf_ns.kernels.network import Network
 from enerf_ns.kernels.precision import full_precision, widened
 
 Brightness = Literal["log-sigmoid", "sigmoid", "exponential"]
-"""What makes brightness of the colour network's output."""
+"""Name of the function from the colour network's output to brightness."""
 
 DARKEST = 2.0 / 255.0
-"""Lowest brightness of a field whose sigmoid spans log brightness; the middle of that span is where all start whose
-brightness is logarithmic."""
+"""Lowest brightness with "log-sigmoid". A field with "log-sigmoid" or "exponential" starts in the middle, in log
+brightness, between this and 1."""
 
 LOG_SIGMOID_RANGE = 4.0
-"""Largest range of log brightness for which log-sigmoid is meant: fitted to a range of 4 its rms error is below 0.001,
-of 6 it is 0.09 and of 10 0.96 by `linlog`, of which it spans 5.24; the exponential's is 0.02 at 10
-(`benchmarks/dynamic_range.py`)."""
+"""Largest range of log brightness for which "log-sigmoid" is meant. Its rms error, fitted to a range of log brightness
+by `linlog`, is below 0.001 at a range of 4, 0.09 at 6 and 0.96 at 10, because it spans only 5.24. The rms error of
+"exponential" is 0.02 at 10 (`benchmarks/dynamic_range.py`)."""
 
 LARGEST_EXPONENT = 30.0
-"""Largest exponent of `limited_exp`: far above what training arrives at, and small enough that whatever is made of its
-exponential along a ray is finite in float32."""
+"""Largest exponent of `limited_exp`. Training stays far below it, and products and sums along a ray stay finite in
+float32."""
 
 
 class _LimitedExp(Function):
@@ -49,22 +49,23 @@ class _LimitedExp(Function):
 
 
 def limited_exp(exponent: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Exponential, constant above `LARGEST_EXPONENT`.
+    """Returns the exponential, which is constant above `LARGEST_EXPONENT`.
 
-    Its gradient is that of Nerfstudio's `trunc_exp`, which is the exponential's from -15 to 15 and constant beyond, so
-    that what is far too dense or bright is still pushed back.
+    The gradient is that of Nerfstudio's `trunc_exp`: the exponential from -15 to 15, and constant beyond. So the
+    gradient still reduces a density or a brightness that is far too large.
     """
     return cast("Tensor", _LimitedExp.apply(exponent))
 
 
 def brightness_of(output: Float[Tensor, "*batch"], activation: Brightness) -> Float[Tensor, "*batch"]:
-    """Brightness that the colour network's output stands for.
+    """Returns the linear brightness for an output of the colour network.
 
     Args:
-        output: Any number; 0 before training.
-        activation: log-sigmoid lets a sigmoid span log brightness, from `DARKEST` to 1, so that the field starts in the
-            middle of what the sensor can tell apart; sigmoid brightness itself, as in the paper, which starts near its
-            upper end; exponential starts where log-sigmoid does, at the same slope, and has no upper end.
+        output: Any number; about 0 before training.
+        activation: With "log-sigmoid" a sigmoid spans log brightness from `DARKEST` to 1, so that the field starts in
+            the middle of the range that the sensor resolves. With "sigmoid", as in the paper, a sigmoid spans linear
+            brightness from 0 to 1, so that the field starts near the upper end in log brightness. "exponential" starts
+            at the value and the slope of "log-sigmoid", and has no upper end.
     """
     if activation == "exponential":
         return DARKEST**0.5 * limited_exp(-0.25 * math.log(DARKEST) * output)
@@ -73,15 +74,19 @@ def brightness_of(output: Float[Tensor, "*batch"], activation: Brightness) -> Fl
 
 
 class HashDensity(nn.Module):
-    """Density, and features beside it, of a point in a box: hash grid and one hidden layer.
+    """Density and features of points in a box, by a hash grid and a network with one hidden layer.
 
     Args:
-        aabb: Box in scene units, shape (2, 3). Outside it density is zero.
-        contraction: Reach beyond the box, which lies within [-1, 1], to infinity (mip-NeRF 360, Barron et al., CVPR
-            2022).
-        num_features: Outputs beside the density.
+        aabb: Box in scene units, shape (2, 3). Without contraction, density outside the box is zero.
+        num_levels: Levels of the hash grid.
+        min_res, max_res: Lattice cells along a side of the box, at the coarsest and at the finest level.
+        log2_table_size: Each level has 2**log2_table_size rows.
+        hidden_dim: Width of the hidden layer.
+        contraction: Whether space beyond the box, up to infinity, is contracted (mip-NeRF 360, Barron et al., CVPR
+            2022). The box lies within [-1, 1].
+        num_features: Number of features.
         init_density: Density before training, in 1 / scene unit.
-        backend: What computes the hash grid, as of `backend_of` in `enerf_ns.kernels.hash_grid`.
+        backend: Backend of the hash grid; see `enerf_ns.kernels.hash_grid.backend_of`.
     """
 
     def __init__(
@@ -107,14 +112,14 @@ class HashDensity(nn.Module):
             from nerfstudio.field_components.spatial_distortions import SceneContraction
 
             self.contraction = SceneContraction(order=math.inf)
-        # contracted space is twice as wide as what lies within [-1, 1], which keeps its cells
+        # contracted space is twice as wide as [-1, 1]; so the cells within [-1, 1] keep their size
         finest = 2 * max_res if contraction else max_res
         self.grid = HashGrid(num_levels, min_res, finest, log2_table_size, backend=backend)
         self.network = Network(self.grid.out_dim, 2, hidden_dim, 1 + num_features, backend)
 
     def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
-        """Density in 1 / scene unit, and the features."""
-        # coordinate by coordinate in memory, as the kernels take them: what follows is vectorised
+        """Returns density, in 1 / scene unit, and features, (*batch, num_features), at positions in scene units."""
+        # one coordinate after the other in memory, as the kernels need it; so the next operations are vectorised
         rows = positions.reshape(-1, 3).t().contiguous()
         unit = self.unit(rows.t().view(positions.shape))
         density, features = self.at(unit.clamp(0.0, 1.0))
@@ -123,35 +128,36 @@ class HashDensity(nn.Module):
         return density, features
 
     def unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Positions as shares of the sides of the box, or of contracted space: in [0, 1] where density may be."""
+        """Returns positions relative to the box, or to contracted space. In it all three coordinates are in [0, 1]."""
         if self.contraction is not None:
             return 0.5 + 0.25 * self.contraction(positions)
         return SceneBox.get_normalized_positions(positions, self.aabb)
 
     def at(self, unit: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 1"], Tensor]:
-        """Density in 1 / scene unit, and the features, at positions of `unit` in [0, 1], faces of the box included."""
-        # rows of a matrix: where there are more axes, PyTorch multiplies in another way, which is slower
+        """Returns density, in 1 / scene unit, and features at positions from `unit` in [0, 1], also on the faces."""
+        # a matrix, because PyTorch's product of tensors with more axes is slower
         output = self.network(self.grid(unit.reshape(-1, 3)))
-        # features first, as the kernels have them, so that gradients are put together without moving them around
+        # split along the first axis of the kernels' memory, so that gradients are joined without a copy
         parts = output.t().split_with_sizes([1, output.shape[1] - 1])
         density, features = (part.t().view(*unit.shape[:-1], len(part)) for part in parts)
         return self.init_density * limited_exp(widened(density)), features
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
-        """Density alone."""
+        """Returns the density, in 1 / scene unit."""
         return self(positions)[0]
 
 
 class EnerfField(Field):
-    """Density and colour of E-NeRF (hash grid of Mueller et al. 2022, two networks, spherical harmonics).
+    """The radiance field of E-NeRF: hash grid (Müller et al., 2022), density network and colour network.
 
     Args:
         aabb: Box in scene units, shape (2, 3).
         num_channels: 1 for grey, 3 for colour.
-        view_direction: Whether colour depends on the direction from which a point is seen.
-        density: Keywords of `HashDensity`.
+        view_direction: Whether brightness depends on the viewing direction, which spherical harmonics encode.
         hidden_dim_colour: Width of the hidden layers of the colour network.
-        brightness: What makes brightness of the colour network's output; see `brightness_of`.
+        num_features: Number of features that the density network passes to the colour network.
+        brightness: Function from the colour network's output to brightness; see `brightness_of`.
+        density: Other keyword arguments of `HashDensity`.
     """
 
     def __init__(
@@ -175,14 +181,13 @@ class EnerfField(Field):
         backend = self.geometry.grid.backend
         self.colour_network = Network(directions + num_features, num_layers, hidden_dim_colour, num_channels, backend)
 
-    @full_precision  # in bfloat16 density is 0.2 to 1.2 % off, and a change of log brightness 0.3 to 0.7 %
+    @full_precision  # bfloat16 has errors of 0.2 to 1.2 % in density, of 0.3 to 0.7 % in changes of log brightness
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Density in 1 / scene unit, shape (*batch, 1), and features for the colour network."""
+        """Returns density, in 1 / scene unit, shape (*batch, 1), and features for the colour network."""
         return self.geometry(ray_samples.frustums.get_positions())
 
-    @full_precision
     def get_outputs(self, ray_samples: RaySamples, density_embedding: Tensor | None = None) -> dict:
-        """Brightness, shape (*batch, num_channels): 0 or more, and at most 1 but where it is exponential."""
+        """Returns linear brightness, shape (*batch, num_channels), from 0 to 1. "exponential" has no upper limit."""
         assert density_embedding is not None
         directions = ray_samples.frustums.directions.reshape(-1, 3)
         colour = self.colour(density_embedding.reshape(len(directions), density_embedding.shape[-1]), directions)
@@ -190,7 +195,7 @@ class EnerfField(Field):
 
     @full_precision
     def colour(self, features: Float[Tensor, "points features"], directions: Float[Tensor, "points 3"]) -> Tensor:
-        """Brightness, shape (points, num_channels), of points with these features seen along these directions."""
+        """Returns brightness, shape (points, num_channels), of points with these features, seen in these directions."""
         if self.direction_encoding is not None:
             features = torch.cat([self.direction_encoding(get_normalized_directions(directions)), features], dim=-1)
         return brightness_of(self.colour_network(features), self.brightness)

@@ -1,4 +1,8 @@
-"""Pictures without what nobody sees of them: samples along rays, from the camera on until hardly any light is left."""
+"""Volume rendering from front to back: a ray stops where its transmittance is almost 0.
+
+`enerf_ns.rendering.front_to_back_numba` renders the same pictures by compiled kernels. So a change here needs a change
+there.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,10 @@ from nerfstudio.cameras.rays import RaySamples
 from torch import Tensor
 
 ROUNDS = 8
-"""Times, at most, that it is looked what light is left."""
+"""Largest number of rounds. After each round, rays without transmittance are left out."""
 
 FEWEST_SAMPLES = 8
-"""Of a ray that are asked for at once, unless memory forbids."""
+"""Smallest number of samples of a ray in one round."""
 
 
 def front_to_back(
@@ -23,15 +27,18 @@ def front_to_back(
     see: Callable[[Tensor, Tensor, Tensor], None] | None = None,
     samples_at_once: int | None = None,
 ) -> Float[Tensor, "rays samples 1"]:
-    """Weights of samples as of `RaySamples.get_weights`, but 0 behind what lets hardly any light through.
+    """Returns the weights of `RaySamples.get_weights`, but 0 where a ray's transmittance is almost 0.
 
     Args:
-        samples: Shape (rays, samples a ray).
-        density: Density, shape (*batch, 1), and features, shape (*batch, features), at positions, shape (*batch, 3).
-        faint: Share of a ray's light, from 0 to 1, that may be missed for what lies behind, and as much for what is
-            thin.
-        see: Is told of samples that are not thin: the index of their ray, their weight, shape (seen, 1), and features.
-        samples_at_once: For which density is asked. None: all of a round.
+        samples: Samples, shape (rays, samples per ray).
+        density: Function that returns density, shape (*batch, 1), and features, shape (*batch, features), at positions,
+            shape (*batch, 3).
+        faint: Transmittance, from 0 to 1, at which a ray ends. `see` leaves out samples of small weight; their sum is
+            at most `faint`, too.
+        see: Function that is called with all other samples: the index of their ray, shape (seen), their weight, shape
+            (seen, 1), and their features, shape (seen, features).
+        samples_at_once: Number of samples for one call of density; at least those of one ray and round. Default: all
+            samples of a round.
     """
     assert samples.shape is not None and samples.deltas is not None
     num_rays, num_samples = samples.shape
@@ -46,12 +53,12 @@ def front_to_back(
             densities, features = density(positions[ray, here])
             thickness = densities[..., 0] * deltas[ray, here]
             behind = thickness.cumsum(dim=-1)
-            before = torch.nn.functional.pad(behind[:, :-1], (1, 0))  # not behind - thickness, which cancels
+            before = torch.nn.functional.pad(behind[:, :-1], (1, 0))  # behind - thickness would lose digits
             weight = transmittance[ray, None] * torch.exp(-before) * (1.0 - torch.exp(-thickness))
             weights[ray, here] = weight
             transmittance[ray] = transmittance[ray] * torch.exp(-behind[:, -1])
             if see is not None:
-                seen = ~(weight <= faint / num_samples)  # also what is no number
+                seen = ~(weight <= faint / num_samples)  # NaN counts as seen
                 see(ray[:, None].expand_as(seen)[seen], weight[seen][:, None], features[seen])
         lit = lit[~(transmittance[lit] <= faint)]
         if not len(lit):

@@ -1,7 +1,11 @@
-"""Pictures on the CPU: some rays at a time go from their samples to their brightness while all of it is in the cache.
+"""Volume rendering on the CPU by compiled kernels, for pictures.
 
-The sum that `enerf_ns.rendering.front_to_back` and the field compute with PyTorch, which writes every number on the way
-to memory. Samples of several rays go through hash grid and networks in blocks, by vector instructions.
+The kernels compute what `enerf_ns.rendering.ray_samplers`, `front_to_back` and `field` compute with PyTorch. PyTorch
+writes every intermediate value to memory. Here a few rays go from samples to brightness while all values stay in the
+cache, and blocks of their samples go through hash grid and networks by vector instructions.
+
+A change of samplers, field or rendering needs a change of this module. Its contract is a test in
+`tests/method/test_model.py`: with kernels and with PyTorch, a picture is the sum over all samples.
 """
 
 from __future__ import annotations
@@ -23,26 +27,26 @@ from enerf_ns.rendering.field import DARKEST, LARGEST_EXPONENT, EnerfField, Hash
 from enerf_ns.rendering.ray_samplers import PairedProposalSampler, PairedSpacedSampler
 
 RAYS = 32
-"""Rays that go through together."""
+"""Number of rays that are rendered together."""
 
 TASK = 8 * RAYS
-"""Rays that a thread takes at a time."""
+"""Number of rays that a thread takes at a time."""
 
 ROUND = 8
-"""Samples of a ray between two looks at what light is left."""
+"""Number of samples of a ray in one round. After each round, rays without transmittance are left out."""
 
 PADDING = np.float32(0.01)
-"""Added to the weight of each stretch of a ray before it is sampled, as in Nerfstudio's PDFSampler."""
+"""Added to the weight of each stretch of a ray before sampling, as in Nerfstudio's PDFSampler."""
 
 LOG_DARKEST = np.float32(math.log(DARKEST))
 HIGHEST = np.float32(LARGEST_EXPONENT)
 ZERO, QUARTER, HALF, ONE, TWO = np.float32(0), np.float32(0.25), np.float32(0.5), np.float32(1), np.float32(2)
 ACTIVATIONS = ("sigmoid", "log-sigmoid", "exponential")
-"""Numbers, by their place, of what makes brightness, as the kernels know it."""
+"""Names of `enerf_ns.rendering.field.Brightness`; the kernels use the index."""
 
 
 class Geometry(NamedTuple):
-    """A `HashDensity`: the levels of its grid, shape (levels, rows, 2), its network, and the box that it fills."""
+    """A `HashDensity` as arrays: the levels of its hash grid, shape (levels, rows, 2), its network and its box."""
 
     levels: np.ndarray
     scalings: np.ndarray
@@ -55,7 +59,7 @@ class Geometry(NamedTuple):
 
 @vectorised
 def _unit(geometry, x, y, z):
-    """A position as `enerf_ns.rendering.field.HashDensity.unit` has it."""
+    """Returns a position relative to the box or contracted space, as `HashDensity.unit` does."""
     if geometry.contraction:
         distance = max(abs(x), abs(y), abs(z))
         scale = QUARTER if distance < 1 else QUARTER * (TWO - ONE / distance) / distance
@@ -66,7 +70,7 @@ def _unit(geometry, x, y, z):
 
 @vectorised
 def _geometry(geometry, points, number, cells, values):
-    """Densities, then features, at points of shape (3, BLOCK), of which it makes positions in the grid."""
+    """Returns densities, then features, at points of shape (3, BLOCK). Overwrites points by positions in the grid."""
     inside = np.empty(BLOCK, np.float32)
     for p in range(number):
         x, y, z = _unit(geometry, points[0, p], points[1, p], points[2, p])
@@ -85,9 +89,10 @@ def _geometry(geometry, points, number, cells, values):
 
 
 @vectorised
-def _distance(share, near, far, is_piecewise):
-    """Of a place on a ray: even between near and far end, or, as in mip-NeRF 360, up to 1 and then in its inverse."""
-    if not is_piecewise:
+def _distance(share, near, far, contraction):
+    """Returns the distance at a share, from 0 to 1, of a ray. Shares are even in distance. With contraction they are
+    even in distance up to 1, and in its inverse beyond, as in mip-NeRF 360."""
+    if not contraction:
         return near + share * (far - near)
     low = HALF * near if near < ONE else ONE - HALF / near
     high = HALF * far if far < ONE else ONE - HALF / far
@@ -97,7 +102,7 @@ def _distance(share, near, far, is_piecewise):
 
 @vectorised
 def _resample(weights, edges):
-    """Edges, as shares of a ray, of stretches that hold as much of the weights each; these are of even stretches."""
+    """Writes edges, as shares of a ray, that divide the sum of weights evenly. The weights are of even stretches."""
     number, stretches = len(weights), len(edges) - 1
     total = ZERO
     for s in range(number):
@@ -114,8 +119,8 @@ def _resample(weights, edges):
 
 @vectorised
 def _expect(rays, r, voxels, field, faint, weights):
-    """Weights of even stretches of a ray by densities at the corners of voxels, 0 behind what lets hardly any light
-    through."""
+    """Writes weights of even stretches of a ray, from densities at the corners of voxels. Weights are 0 where the
+    transmittance is almost 0."""
     origins, directions, nears, fars, _ = rays
     top0, top1, top2 = voxels.shape[2] - 2, voxels.shape[1] - 2, voxels.shape[0] - 2
     size0, size1, size2 = np.float32(top0 + 1), np.float32(top1 + 1), np.float32(top2 + 1)
@@ -131,7 +136,7 @@ def _expect(rays, r, voxels, field, faint, weights):
             origins[r, 2] + directions[r, 2] * middle,
         )
         x, y, z = min(max(x, ZERO), ONE) * size0, min(max(y, ZERO), ONE) * size1, min(max(z, ZERO), ONE) * size2
-        # what is no number has any index
+        # the index of NaN is undefined
         i, j, k = min(max(int(x), 0), top0), min(max(int(y), 0), top1), min(max(int(z), 0), top2)
         x, y, z = x - np.float32(i), y - np.float32(j), z - np.float32(k)
         low = (ONE - y) * ((ONE - x) * voxels[k, j, i] + x * voxels[k, j, i + 1]) + y * (
@@ -142,7 +147,7 @@ def _expect(rays, r, voxels, field, faint, weights):
         )
         passed = np.exp(-((ONE - z) * low + z * high) * (end - begin))
         weight = light * (ONE - passed)
-        weights[s] = weight if weight >= 0 else ZERO  # also where it is no number
+        weights[s] = weight if weight >= 0 else ZERO  # NaN becomes 0
         light *= passed
         begin = end
         if light <= faint:
@@ -152,7 +157,7 @@ def _expect(rays, r, voxels, field, faint, weights):
 
 @vectorised
 def _brightness(output, activation):
-    """As `enerf_ns.rendering.field.brightness_of`."""
+    """Returns the brightness of `enerf_ns.rendering.field.brightness_of`."""
     if activation == 2:
         return np.exp(HALF * LOG_DARKEST + min(-QUARTER * LOG_DARKEST * output, HIGHEST))
     share = ONE / (ONE + np.exp(-output))
@@ -161,9 +166,8 @@ def _brightness(output, activation):
 
 @vectorised
 def _render(rays, first, last, voxels, num_stretches, field, colour, activation, faint, num_samples, pictures):
-    """Rays from the first to before the last. Voxels is None where samples lie evenly along a ray."""
+    """Renders the rays from first to last - 1. If voxels is None, samples lie evenly along each ray."""
     origins, directions, nears, fars, encoded = rays
-    is_piecewise = field.contraction
     rgb, accumulation, depth = pictures
     cells, points = new_cells(), np.empty((3, BLOCK), np.float32)
     field_values, colour_values = new_values(field.network), new_values(colour)
@@ -187,7 +191,7 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
                 _resample(found, edges[r])
         for r in range(num_rays):
             for s in range(num_samples + 1):
-                edges[r, s] = _distance(edges[r, s], nears[start + r], fars[start + r], is_piecewise)
+                edges[r, s] = _distance(edges[r, s], nears[start + r], fars[start + r], field.contraction)
 
         num_lit = num_rays
         for r in range(num_rays):
@@ -222,7 +226,7 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
                     if before < HALF and accumulation[start + r, 0] >= HALF:
                         depth[start + r, 0] = HALF * (near + far)
                     light *= passed
-                    if not weights[p] <= thin:  # also what is no number
+                    if not weights[p] <= thin:  # NaN counts as seen
                         seen[num_seen] = p
                         num_seen += 1
                 transmittance[r] = light
@@ -248,12 +252,18 @@ def _render(rays, first, last, voxels, num_stretches, field, colour, activation,
             num_lit = still_lit
 
 
-def _made_of(density: HashDensity) -> Geometry:
+def _geometry_of(density: HashDensity) -> Geometry:
     scalings, low = density.grid.scalings.numpy(), density.aabb[0].numpy()
     levels = density.grid.table.detach().numpy().reshape(len(scalings), -1, 2)
     size, init_density = density.aabb[1].numpy() - low, np.float32(density.init_density)
     return Geometry(
-        levels, scalings, layers_of(density.network), init_density, low, size, density.contraction is not None
+        levels,
+        scalings,
+        layers_of(density.network.parameters()),
+        init_density,
+        low,
+        size,
+        density.contraction is not None,
     )
 
 
@@ -264,18 +274,21 @@ def render(
     expected: DensityVoxels | None,
     faint: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What rays show, without gradients.
+    """Renders rays, without gradients.
 
     Args:
-        rays: On the CPU, shape (rays), with nears and fars.
-        field: In float32, with two features per level.
-        sampler: How many samples there are along a ray. They are even where nothing is expected; with
-            contraction, up to a distance of 1, and in its inverse from there on.
-        expected: Whose weights along a ray the samples share evenly, or None.
-        faint: Share of a ray's light that may be missed for what lies behind, and as much for what is thin.
+        rays: Rays on the CPU, shape (rays), with nears and fars.
+        field: A field in float32, with two features per level.
+        sampler: The sampler, for its number of samples along a ray. Without `expected` they are even in distance. With
+            contraction they are even in distance up to 1, and in its inverse beyond.
+        expected: Density by which samples are placed: the weights along a ray are shared evenly between them. None
+            where the sampler has no proposal network.
+        faint: Transmittance at which a ray ends. Samples of small weight are left out; their sum is at most `faint`,
+            too.
 
     Returns:
-        Brightness (rays, channels) before black, accumulation (rays, 1), and median depth along the ray (rays, 1).
+        Brightness (rays, channels) before a black background, accumulation (rays, 1), and median depth along the ray
+        (rays, 1) in scene units.
     """
     assert rays.nears is not None and rays.fars is not None
     directions, encoded = rays.directions, rays.directions[:, :0]
@@ -292,13 +305,13 @@ def render(
         num_samples = sampler.num_nerf_samples_per_ray
     else:
         num_samples = sampler.num_samples
-    what, colour = _made_of(field.geometry), layers_of(field.colour_network)
+    geometry, colour = _geometry_of(field.geometry), layers_of(field.colour_network.parameters())
     activation = ACTIVATIONS.index(field.brightness)
 
     def task(index: int) -> None:
         first, last = TASK * index, min(TASK * (index + 1), len(rays))
         _render(
-            inputs, first, last, voxels, num_stretches, what, colour, activation, np.float32(faint), num_samples,
+            inputs, first, last, voxels, num_stretches, geometry, colour, activation, np.float32(faint), num_samples,
             pictures,
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Samplers along rays for which the two rays of a pair are one: the change between them holds no noise of sampling."""
+"""Samplers that give both rays of a pair the same random numbers, so that their difference has no sampling noise."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from torch import Tensor
 
 @dataclass
 class PairedRayBundle(RayBundle):
-    """Rays of shape (2 * num_pairs + others): the first ones of all pairs, the second ones, then rays on their own."""
+    """Rays of shape (2 * num_pairs + others): the first rays of all pairs, the second rays, then single rays."""
 
     num_pairs: int = 0
 
 
 def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
-    """Random numbers in [0, 1), a row for each ray; those of the two rays of a pair are the same.
+    """Returns random numbers in [0, 1), one row for each ray. The two rays of a pair have the same row.
 
     Args:
-        rays: A `PairedRayBundle`, or any other, whose rays are all on their own.
-        columns: Numbers a ray.
+        rays: A `PairedRayBundle`, or any other bundle, which has no pairs.
+        columns: Numbers per ray.
     """
     pairs = getattr(rays, "num_pairs", 0)
     drawn = torch.rand((len(rays) - pairs, columns), device=rays.origins.device)
@@ -39,14 +39,14 @@ def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
 
 
 class PairedSpacedSampler(SpacedSampler):
-    """One of Nerfstudio's samplers that need no weights; in training, both rays of a pair get the same jitter."""
+    """A sampler of Nerfstudio that needs no weights. In training, both rays of a pair have the same jitter."""
 
     def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
-        """Samples evenly spaced between near and far end, each moved at random within its stretch in training.
+        """Returns samples that are evenly spaced between nears and fars. In training, jitter moves their edges.
 
         Args:
-            ray_bundle: With nears and fars.
-            num_samples: A ray.
+            ray_bundle: Rays with nears and fars.
+            num_samples: Samples per ray. Default: the sampler's number.
         """
         if not self.training:
             return super().generate_ray_samples(ray_bundle, num_samples)
@@ -63,15 +63,15 @@ class PairedSpacedSampler(SpacedSampler):
 
 
 class PairedUniformSampler(PairedSpacedSampler, UniformSampler):
-    """Even in distance."""
+    """Samples that are even in distance."""
 
 
 class PairedPiecewiseSampler(PairedSpacedSampler, UniformLinDispPiecewiseSampler):
-    """Even in distance up to 1, and then in its inverse."""
+    """Samples that are even in distance up to 1, and even in inverse distance beyond."""
 
 
 class PairedPDFSampler(PDFSampler):
-    """Nerfstudio's PDFSampler without its original samples; in training, both rays of a pair get the same jitter."""
+    """Nerfstudio's PDFSampler without the original samples. In training, both rays of a pair have the same jitter."""
 
     def __init__(self, single_jitter: bool = False):
         super().__init__(include_original=False, single_jitter=single_jitter)
@@ -84,14 +84,16 @@ class PairedPDFSampler(PDFSampler):
         num_samples: int | None = None,
         eps: float = 1e-5,
     ) -> RaySamples:
-        """Samples distributed as the weights of earlier ones: their cumulative sum, inverted at stratified heights.
+        """Returns samples that are distributed as the weights of earlier samples.
+
+        The cumulative sum of the weights is inverted at stratified heights.
 
         Args:
             ray_bundle: The rays.
             ray_samples: The earlier samples.
-            weights: Of the earlier samples, 0 or more.
-            num_samples: A ray.
-            eps: Least sum of the weights of a ray.
+            weights: Weights of the earlier samples, 0 or more.
+            num_samples: Samples per ray. Default: the sampler's number.
+            eps: Smallest sum of the weights of a ray.
         """
         if not self.training:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
@@ -122,14 +124,15 @@ class PairedPDFSampler(PDFSampler):
 
 
 class PairedProposalSampler(ProposalNetworkSampler):
-    """Samples where one proposal network expects surfaces; in training, where it does along one ray of a pair.
+    """Samples where one proposal network expects surfaces. In training, both rays of a pair use the network's density
+    along one of them.
 
-    Two rays of a pair are one pixel's, moments apart, and see nearly the same surfaces.
+    The rays of a pair belong to one pixel at two close instants, so they see nearly the same surfaces.
 
     Args:
-        num_proposal_samples: Of the proposal network, along a ray.
-        num_samples: Along a ray.
-        initial_sampler: Places the samples of the proposal network.
+        num_proposal_samples: Samples per ray for the proposal network.
+        num_samples: Samples per ray that are returned.
+        initial_sampler: Sampler that places the samples for the proposal network.
     """
 
     def __init__(self, num_proposal_samples: int, num_samples: int, initial_sampler: SpacedSampler):
@@ -139,21 +142,21 @@ class PairedProposalSampler(ProposalNetworkSampler):
             num_proposal_network_iterations=1,
             initial_sampler=initial_sampler,
             pdf_sampler=PairedPDFSampler(single_jitter=True),
-            update_sched=lambda step: 1 if step > 500 else 0,
+            update_sched=lambda step: 1 if step > 500 else 0,  # then the proposal network learns in every second step
         )
 
     def generate_ray_samples(
         self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
     ) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
-        """Samples, and the weights and the samples of the proposal network, in lists.
+        """Returns samples, and lists of one element: the weights and the samples of the proposal network.
 
         Args:
-            ray_bundle: With nears and fars.
-            density_fns: What expects surfaces, alone: density at positions.
+            ray_bundle: Rays with nears and fars.
+            density_fns: One function: the expected density at positions.
         """
         assert ray_bundle is not None and density_fns is not None
         (expected,) = density_fns
-        if not self.training:  # here, since Nerfstudio's counts pictures as steps
+        if not self.training:  # Nerfstudio's own would count pictures as steps
             samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
             weights = samples.get_weights(expected(samples.frustums.get_positions()))
             found = self.pdf_sampler(ray_bundle, samples, weights, num_samples=self.num_nerf_samples_per_ray)
@@ -168,7 +171,7 @@ class PairedProposalSampler(ProposalNetworkSampler):
 
 
 def _samples(rays: RayBundle, bins: Float[Tensor, "rays edges"], to_distance) -> RaySamples:
-    """Samples between the edges of bins, which are in [0, 1]."""
+    """Returns samples between the edges of bins, which are in [0, 1]."""
     distances = to_distance(bins)
     return rays.get_ray_samples(
         bin_starts=distances[..., :-1, None],

@@ -1,4 +1,4 @@
-"""Which part of the scene the event camera saw, and where the events came from, by the depth that a field renders."""
+"""The part of the scene that the event camera saw, and the places that events came from, by rendered depth."""
 
 from __future__ import annotations
 
@@ -17,51 +17,52 @@ VOXELS = 64
 """Voxels along the longest side of the box."""
 
 NUM_RAYS = 60_000
-"""Rays, spread over the picture and the trajectory, that find out what was seen: 20 for each voxel of a side of the
-box."""
+"""Number of rays, spread over the picture and the trajectory, that find the voxels that were seen: about 15 for each
+voxel of a face of a cubic box."""
 
 NUM_EVENTS = 20_000
-"""Events, at most, that find out where events come from."""
+"""Largest number of events that find the places that events come from."""
 
 FEW_EVENTS = 0.02
-"""As many events as make a place half known, as a share of `SeenVolume.mean_events`."""
+"""Number of events, relative to `SeenVolume.mean_events`, at which `SeenVolume.evidence` is 0.5."""
 
 STEPS_A_VOXEL = 2
-"""Places on a ray, for each voxel that it could pass, of which is noted which voxel they are in."""
+"""Number of points on a ray, for each length of a voxel's side, whose voxels count as passed."""
 
 
 @dataclass(frozen=True)
 class SeenVolume:
-    """Voxels over the scene box: which of them the camera's rays passed, and how many events came from each.
+    """Voxels over the scene box: whether the camera saw each of them, and how many events came from it.
 
-    A voxel is seen where a ray passes it between where the field's samples begin and one voxel behind the surface that
-    the ray shows. What lies beyond the box, as with contraction, counts as not seen, and its events are not counted.
+    A voxel is seen if a ray of the camera passes it. The ray begins where the field's samples begin, and ends one voxel
+    behind the surface that it renders. Space beyond the box, which exists with contraction, is never seen, and has no
+    events.
     """
 
     aabb: Float[Tensor, "2 3"]
-    """Lowest and highest corner of the box, scene units."""
+    """Lowest and highest corner of the box, in scene units."""
     is_seen: Bool[Tensor, "x y z"]
-    """Which voxels were seen."""
+    """Whether each voxel was seen."""
     num_events: Float[Tensor, "x y z"]
-    """Events of the whole recording whose rays end in a voxel or in one of the 26 around it."""
+    """Number of events of the whole recording whose rays end in the voxel or in one of its 26 neighbours."""
     mean_events: float
-    """Mean of these numbers over what the camera sees, each pixel alike."""
+    """Mean of `num_events` over the surfaces that the camera sees, with equal weight for each pixel."""
 
     @classmethod
     @torch.no_grad()
     def of(cls, model: Model, recording: EventRecording, index: EventIndex, camera: PosedCamera) -> SeenVolume:
-        """What the events' camera saw of a trained field; takes a second on two cores.
+        """Returns what the event camera saw of a trained field. This takes about 1 s on two cores.
 
         Args:
-            model: Whose depth is taken, as in evaluation. It is left as it was.
-            recording: That it learnt from. Instants that are held out or in gaps of the poses that are kept count too;
-                those in gaps that are left out do not.
-            index: Of the recording's events.
-            camera: Of the events, along the trajectory of the recording.
+            model: The model that renders depth, as in evaluation. Its mode is the same afterwards.
+            recording: The recording that the model learns from. Held-out instants count. Instants in gaps of the
+                trajectory count, too, unless the gap is left out.
+            index: Index of the recording's events.
+            camera: The event camera along the recording's trajectory.
         """
         aabb = model.scene_box.aabb
         width, height, device = camera.camera.width, camera.camera.height, aabb.device
-        # a sequence that fills the picture evenly at any part of the time: M. Roberts, "The unreasonable effectiveness
+        # a sequence that fills the picture evenly in any part of the time: M. Roberts, "The unreasonable effectiveness
         # of quasirandom sequences", 2018
         places = torch.arange(NUM_RAYS, dtype=torch.float64)[:, None] * torch.tensor([0.7548776662, 0.5698402910])
         x, y = (places % 1.0 * torch.tensor([width, height])).long().unbind(-1)
@@ -80,45 +81,48 @@ class SeenVolume:
         depths = model.get_outputs_for_camera_ray_bundle(rays.reshape((1, len(rays))))["depth"].view(-1, 1).to(device)
         model.train(was_training)
 
-        shape = voxels_of(aabb)
+        shape = grid_shape(aabb)
         voxel = float((aabb[1] - aabb[0]).max()) / VOXELS
         looks, ends = rays[:NUM_RAYS], rays.origins + rays.directions * depths
         assert looks.nears is not None
-        is_seen = passed(aabb, shape, looks.origins, looks.directions, looks.nears, depths[:NUM_RAYS] + voxel)
-        volume = cls(aabb, is_seen, around(counts(aabb, shape, ends[NUM_RAYS:])) / share, 0.0)
+        is_seen = voxels_on_rays(aabb, shape, looks.origins, looks.directions, looks.nears, depths[:NUM_RAYS] + voxel)
+        volume = cls(aabb, is_seen, sum_of_neighbours(points_per_voxel(aabb, shape, ends[NUM_RAYS:])) / share, 0.0)
         return replace(volume, mean_events=float(volume.events(ends[:NUM_RAYS]).mean()))
 
     def seen(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Whether points (scene units) lie in voxels that were seen."""
-        voxels, inside = numbers_of(self.aabb, self.is_seen.shape, points)
+        """Returns whether points, in scene units, lie in voxels that were seen."""
+        voxels, inside = voxel_indices(self.aabb, self.is_seen.shape, points)
         return self.is_seen.flatten()[voxels] & inside
 
     def events(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """How many events of the whole recording came from the voxels that points (scene units) lie in, or from one
-        beside it."""
-        voxels, inside = numbers_of(self.aabb, self.num_events.shape, points)
+        """Returns how many events came from the voxel of each point, in scene units, and from its neighbours."""
+        voxels, inside = voxel_indices(self.aabb, self.num_events.shape, points)
         return self.num_events.flatten()[voxels] * inside
 
     def evidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """How well events tell of what is at points (scene units), from 0, without any, to 1, with beyond number:
-        n / (n + few) for n `events`, where few is `FEW_EVENTS` of their mean."""
+        """Returns the evidence of events at points, in scene units: from 0 without events to 1 with very many.
+
+        It is n / (n + few) for n `events`, where few is `FEW_EVENTS` times `mean_events`.
+        """
         events = self.events(points)
         return events / (events + max(FEW_EVENTS * self.mean_events, 1e-6))
 
 
-def voxels_of(aabb: Float[Tensor, "2 3"]) -> torch.Size:
-    """Voxels along each side of a box, which are about cubes."""
+def grid_shape(aabb: Float[Tensor, "2 3"]) -> torch.Size:
+    """Returns the number of voxels, which are almost cubes, along each side of a box."""
     sides = aabb[1] - aabb[0]
     return torch.Size((VOXELS * sides / sides.max()).round().long().clamp(min=1).tolist())
 
 
-def numbers_of(aabb: Float[Tensor, "2 3"], shape: torch.Size, points: Float[Tensor, "*batch 3"]):
-    """The number of the voxel of each point, 0 beyond the box; and which are within.
+def voxel_indices(aabb: Float[Tensor, "2 3"], shape: torch.Size, points: Float[Tensor, "*batch 3"]):
+    """Returns the index of each point's voxel in the flattened grid, and whether the point is inside the box.
+
+    The index of a point outside the box is 0.
 
     Args:
         aabb: Lowest and highest corner of the box.
-        shape: Voxels along each side.
-        points: Anywhere.
+        shape: Number of voxels along each side.
+        points: Points inside or outside the box.
     """
     places = (points - aabb[0]) / (aabb[1] - aabb[0])
     inside = ((places >= 0.0) & (places < 1.0)).all(-1)
@@ -126,7 +130,7 @@ def numbers_of(aabb: Float[Tensor, "2 3"], shape: torch.Size, points: Float[Tens
     return torch.where(inside, (x * shape[1] + y) * shape[2] + z, 0), inside
 
 
-def passed(
+def voxels_on_rays(
     aabb: Float[Tensor, "2 3"],
     shape: torch.Size,
     origins: Float[Tensor, "rays 3"],
@@ -134,37 +138,39 @@ def passed(
     begins: Float[Tensor, "rays 1"],
     ends: Float[Tensor, "rays 1"],
 ) -> Bool[Tensor, "x y z"]:
-    """Which voxels of a box rays pass, but for corners of them that they cut off.
+    """Returns the voxels of a box that rays pass. A voxel of which a ray cuts only a corner may be missed.
 
     Args:
         aabb: Lowest and highest corner of the box.
-        shape: Voxels along each side.
-        origins, directions: Of the rays; directions of length 1.
-        begins, ends: Distances along each ray between which it counts.
+        shape: Number of voxels along each side.
+        origins, directions: Origins and directions of the rays; directions have length 1.
+        begins, ends: Distances along each ray at which it begins and ends.
     """
     found = torch.zeros(shape.numel(), dtype=torch.bool, device=aabb.device)
     step = float((aabb[1] - aabb[0]).max()) / max(shape) / STEPS_A_VOXEL
     diagonal = float((aabb[1] - aabb[0]).norm())
     to_corners = (aabb[:, None] - origins) / directions.where(directions.abs() > 1e-12, 1e-12)
-    begins = torch.maximum(begins, to_corners.amin(0).amax(-1, keepdim=True))  # where the box begins
+    begins = torch.maximum(begins, to_corners.amin(0).amax(-1, keepdim=True))  # the first point in the box
     for number in range(int(diagonal / step) + 2):
         distances = begins + number * step
         left = (distances < ends)[:, 0]
         if not left.any():
             break
         origins, directions, begins, ends = (column[left] for column in (origins, directions, begins, ends))
-        voxels, inside = numbers_of(aabb, shape, origins + directions * distances[left])
+        voxels, inside = voxel_indices(aabb, shape, origins + directions * distances[left])
         found[voxels[inside]] = True
     return found.view(shape)
 
 
-def counts(aabb: Float[Tensor, "2 3"], shape: torch.Size, points: Float[Tensor, "points 3"]) -> Float[Tensor, "x y z"]:
-    """How many points lie in each voxel of a box."""
-    voxels, inside = numbers_of(aabb, shape, points)
+def points_per_voxel(
+    aabb: Float[Tensor, "2 3"], shape: torch.Size, points: Float[Tensor, "points 3"]
+) -> Float[Tensor, "x y z"]:
+    """Returns the number of points in each voxel of a box."""
+    voxels, inside = voxel_indices(aabb, shape, points)
     return torch.bincount(voxels[inside], minlength=shape.numel()).float().view(shape)
 
 
-def around(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
-    """The sum over each voxel and those beside it, corners included."""
+def sum_of_neighbours(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
+    """Returns for each voxel the sum of its value and the values of its 26 neighbours."""
     padded = torch.nn.functional.pad(values[None, None], (1,) * 6)
     return 27.0 * torch.nn.functional.avg_pool3d(padded, 3, stride=1)[0, 0]

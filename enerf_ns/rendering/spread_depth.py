@@ -1,4 +1,4 @@
-"""Depth spread from where it is known into plain regions, up to the edges of brightness and of depth."""
+"""Spreads depth from pixels where it is known over untextured regions, up to edges of brightness and of depth."""
 
 from __future__ import annotations
 
@@ -14,28 +14,30 @@ from torch import Tensor
 from enerf_ns.rendering.field import DARKEST
 
 EDGE_OF_BRIGHTNESS = 0.1
-"""Difference of log brightness between neighbours that depth is spread over less by a factor of e."""
+"""Difference of log brightness between neighbours that weakens spreading by a factor of e."""
 
 EDGE_OF_DEPTH = 0.02
-"""Difference of log depth between neighbours that depth is spread over less by a factor of e."""
+"""Difference of log depth between neighbours that weakens spreading by a factor of e."""
 
 SMOOTHNESS = 100.0
-"""How much smoothness weighs against depth that is known for sure."""
+"""Weight of smoothness relative to depth of confidence 1."""
 
 PASSES, ATTENUATION = 3, 0.25
-"""Passes along rows and columns, and the share of the smoothness of one that the next takes."""
+"""Number of passes along rows and columns, and the factor of smoothness from one pass to the next."""
 
 LEAST_WEIGHT = 1e-4
-"""Weight of depth without any confidence."""
+"""Weight of depth of confidence 0."""
 
 LEVELS_AN_EDGE = 4.0
-"""Levels of the 8 bits of the guide for an edge that lessens spreading by e."""
+"""Levels, of the 256 in the guide picture, for an edge that weakens spreading by a factor of e."""
 
 
 class KnowsDepth(Protocol):
-    """A model that tells how far the depth that it renders is known."""
+    """A model that returns the confidence in the depth that it renders, and the far depth."""
 
-    def depth_evidence(self, rays: RayBundle, depth: Tensor) -> tuple[Tensor, Tensor]: ...
+    def depth_evidence(self, rays: RayBundle, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns what `EnerfModel.depth_evidence` returns."""
+        ...
 
 
 def depth_evidence(
@@ -45,17 +47,17 @@ def depth_evidence(
     brightness: Float[Tensor, "height width channels"],
     scale: float,
 ) -> tuple[Float[Tensor, "height width 1"], Float[Tensor, "height width 1"]]:
-    """How far the depth of a picture is known, from 0 to 1, and that depth spread from where it is.
+    """Returns the confidence in the depth of a picture, and the depth spread from pixels of high confidence.
 
     Args:
-        model: That rendered the picture, in evaluation.
-        rays: Of the picture.
-        depth: Rendered, metres along the optical axis.
-        brightness: Rendered, linear, 0 or more.
+        model: The model that rendered the picture, in evaluation mode.
+        rays: Rays of the picture.
+        depth: Rendered depth along the optical axis, in metres.
+        brightness: Rendered linear brightness, 0 or more.
         scale: Scene units per metre.
 
     Returns:
-        Confidence, as of `EnerfModel.depth_evidence`, and `spread_depth` of metres along the optical axis.
+        Confidence from 0 to 1 (`EnerfModel.depth_evidence`), and `spread_depth` along the optical axis, in metres.
     """
     along = scale * rays.metadata["directions_norm"].to(depth.device)
     confidence, far = model.depth_evidence(rays, depth * along)
@@ -68,20 +70,21 @@ def spread_depth(
     confidence: Float[Tensor, "height width 1"],
     brightness: Float[Tensor, "height width channels"],
 ) -> Float[Tensor, "height width 1"]:
-    """Depth where it is known, and elsewhere what the known depths around it make of it.
+    """Returns the depth where it is known, and depth spread from known pixels elsewhere.
 
-    Weighted least squares on inverse depth, in which planes are even: D. Min et al., "Fast Global Image Smoothing Based
-    on Weighted Least Squares", TIP 2014, by OpenCV. The data are weighted by the square of their confidence. Where a
-    ray's light comes from many places, they lean to the far ones: fog stands before surfaces, not behind.
+    This is weighted least squares on inverse depth, in which a plane is linear: D. Min et al., "Fast Global Image
+    Smoothing Based on Weighted Least Squares", TIP 2014, as OpenCV implements it. The weight of a pixel is the square
+    of its confidence. At low confidence the pixel's value is near the far depth, since fog stands before surfaces and
+    not behind them.
 
     Args:
-        depth: Of pixels, above 0, of any unit, along the optical axis or along rays.
-        far_depth: Of `EnerfModel.depth_evidence`, of the same kind.
-        confidence: From 0 to 1.
-        brightness: Linear, 0 or more.
+        depth: Depth of pixels, above 0, in any unit, along the optical axis or along rays.
+        far_depth: The far depth of `EnerfModel.depth_evidence`, in the same unit and direction.
+        confidence: Confidence in depth, from 0 to 1.
+        brightness: Linear brightness, 0 or more.
 
     Returns:
-        Of the kind of the depth; all of it as it was where not all depth is finite and above 0.
+        Depth in the unit and direction of `depth`. It is `depth` itself if any depth is not finite or not above 0.
     """
     if not ((depth > 0.0) & depth.isfinite() & (far_depth > 0.0) & far_depth.isfinite()).all():
         return depth

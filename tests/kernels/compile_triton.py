@@ -1,4 +1,4 @@
-"""Compiles the Triton kernels of the hash grid for a GPU of some compute capability, which need not be here: 80, 90."""
+"""Compiles the Triton kernels of the hash grid for a compute capability, such as 80 or 90. No GPU is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The hash grid in Nerfstudio's own modules."""
+"""The fast hash grid gives the same numbers inside Nerfstudio's modules."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""All backends of the hash grid against Nerfstudio's, against finite differences and against each other."""
+
 from __future__ import annotations
 
 import os
@@ -20,7 +22,7 @@ SETTINGS: dict[str, Any] = {"num_levels": 5, "min_res": 4, "max_res": 100, "log2
 
 
 def device_of(backend: str) -> str:
-    """Device on which a backend is tested; skips where its package is missing."""
+    """Returns the device on which a backend is tested; skips the test if its package is missing."""
     if backend == "torch":
         return "cpu"
     return pytest.importorskip(BACKENDS[backend].package) and import_module(BACKENDS[backend].module).DEVICE
@@ -56,7 +58,7 @@ def positions_on_cpu(kind: str) -> torch.Tensor:
         return torch.rand(500, 3, generator=generator)
     if kind == "outside":
         return torch.rand(500, 3, generator=generator) * 1.4 - 0.2
-    if kind == "on the lattice":  # of the coarsest level in all axes, of other levels in some
+    if kind == "on the lattice":  # along all axes on the coarsest level, along some axes on the others
         return torch.randint(0, 5, (300, 3), generator=generator) / 4
     return torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
 
@@ -78,7 +80,7 @@ def test_values_and_gradients_are_nerfstudios(grid, nerfstudio, kind):
 
     torch.testing.assert_close(encoding, expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(grid.table.grad, nerfstudio.hash_table.grad, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(x.grad, x_nerfstudio.grad, rtol=1e-4, atol=1e-3)  # up to 200 a level
+    torch.testing.assert_close(x.grad, x_nerfstudio.grad, rtol=1e-4, atol=1e-3)  # values reach 200 per level
 
 
 @pytest.mark.parametrize("levels", [(1, 16, 1024), (10, 16, 1024), (16, 16, 8192), (7, 5, 99)])
@@ -89,7 +91,7 @@ def test_scalings_are_nerfstudios(levels):
 
 
 def test_gradients_are_finite_differences(grid):
-    # The encoding is linear along each axis within a cell, so that central differences only suffer from rounding.
+    # Within a cell the encoding is linear along each axis, so rounding is the only error of central differences.
     step = 1e-3
     x = torch.rand(2000, 3, generator=torch.Generator().manual_seed(3)).to(grid.table.device)
     to_lattice = (x[:, None] * grid.scalings[:, None] - (x[:, None] * grid.scalings[:, None]).round()).abs()
@@ -221,7 +223,7 @@ def test_backends_are_the_reference_whatever_the_size(backend, seed):
     torch.manual_seed(seed)
     grid = HashGrid(num_levels, 2, int(draw.integers(3, 3000)), log2_table_size, features, 1.0, backend)
     grid.to(device_of(backend))
-    # in the box and around it, on planes of the coarsest lattice, and on the faces of the box
+    # positions in the box and around it, on planes of the coarsest lattice, and on the faces of the box
     inside = torch.rand(int(draw.integers(1, 3000)), 3) * 1.2 - 0.1
     x = torch.cat([inside, inside.mul(2).round() / 2, inside.round()]).to(grid.table.device)
     grad_encoding = torch.randn(len(x), grid.out_dim, device=x.device)
@@ -276,7 +278,7 @@ def test_errors_say_what_is_wrong():
 
 
 def test_kernels_work_where_no_cache_can_be_written():
-    # Numba finds no place for the cache of a source file that does not exist, and says so when it decorates.
+    # Numba finds no folder for the cache of a source file that does not exist, and raises when it decorates.
     uncached: dict[str, Any] = {"__name__": "uncached"}
     exec(compile(Path(hash_grid_numba.__file__).read_text(), "absent/hash_grid_numba.py", "exec"), uncached)
     grid = HashGrid(**SETTINGS, backend="numba")

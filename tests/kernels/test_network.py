@@ -1,4 +1,4 @@
-"""Compiled networks against PyTorch's."""
+"""Compiled networks against PyTorch's networks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def is_compiled(output: Tensor) -> bool:
 
 
 def results(network: MLP, x: Tensor, weight: Tensor) -> list[Tensor]:
-    """The output, and gradients of a weighted sum of it for inputs and parameters."""
+    """Returns the output, and the gradients of its weighted sum with respect to inputs and parameters."""
     output = network(x)
     return [output, *torch.autograd.grad((output * weight).sum(), [x, *network.parameters()])]
 
@@ -37,7 +37,7 @@ def results(network: MLP, x: Tensor, weight: Tensor) -> list[Tensor]:
 def test_values_and_gradients_are_pytorch_s(widths: tuple[int, int, int], num_layers: int, points: int):
     torch.manual_seed(points)
     network = Network(widths[0], num_layers, widths[1], widths[2])
-    exact = copy.deepcopy(network).double()  # which the kernels do not take
+    exact = copy.deepcopy(network).double()  # kernels take only float32
     x, weight = torch.randn(points, widths[0]), torch.randn(points, widths[2])
     found = results(network, x.requires_grad_(), weight)
     expected = results(exact, x.detach().double().requires_grad_(), weight.double())
@@ -78,7 +78,7 @@ def test_memory_in_any_order_does(transposed: bool):
 
 
 def test_one_output_may_be_used_alone():
-    """Gradients of what only a part of the output went into, as densities without features."""
+    """Gradients are right if only a part of the output is used, such as densities without features."""
     network = Network(8, 2, 16, 4)
     x = torch.randn(300, 8, requires_grad=True)
     found = torch.autograd.grad(network(x)[:, 2].square().sum(), [x, *network.parameters()])

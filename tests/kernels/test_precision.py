@@ -1,4 +1,4 @@
-"""What is formed from half precision, or under autocast, is formed in float32."""
+"""Losses, and functions with `full_precision`, compute in float32 from half precision and under autocast."""
 
 from __future__ import annotations
 

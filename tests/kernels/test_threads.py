@@ -1,4 +1,4 @@
-"""Threads of kernels, and of PyTorch beside them."""
+"""The numbers of threads of the kernels and of PyTorch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_each_task_is_done_once(three_threads, number: int):
 
 
 def meeting(parties: int) -> int:
-    """How many threads at a time do tasks: each waits until so many are there."""
+    """Returns how many threads do tasks at the same time: each task waits until all have started."""
     barrier, threads = threading.Barrier(parties), set()
 
     def task(index: int) -> None:

@@ -1,4 +1,4 @@
-"""Densities between the corners of voxels, against SciPy's interpolation of what the network says there."""
+"""Densities within voxels against SciPy's interpolation of the network's densities at the corners."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The field: its box, its ranges of density and brightness, and its gradients."""
+
 from __future__ import annotations
 
 from typing import Any
@@ -59,7 +61,7 @@ LOGITS = torch.cat([torch.linspace(-1e4, 1e4, 401), torch.linspace(-100.0, 100.0
 
 
 def test_the_exponential_of_any_number_is_finite_and_so_is_its_gradient():
-    """It is Nerfstudio's to the bit below the limit, and what lies above it is still pushed back."""
+    """Below the limit it equals Nerfstudio's to the bit; above it there is still a gradient."""
     logits = LOGITS.clone().requires_grad_()
     limited = limited_exp(logits)
     limited.sum().backward()
@@ -74,7 +76,7 @@ def test_the_exponential_of_any_number_is_finite_and_so_is_its_gradient():
 
 @pytest.mark.parametrize("length", [0.0, 1e-38, 1e-4, 1.0, 1e4])
 def test_weights_of_any_density_and_length_are_those_of_the_closed_form(length: float):
-    """And so are their gradients, by the rule of the exponential: densities 0, subnormal and as large as can be."""
+    """Their gradients are right, too. Densities are 0, subnormal and as large as possible."""
     generator = torch.Generator().manual_seed(0)
     logits = LOGITS[torch.randint(len(LOGITS), (200, 12), generator=generator)]
     logits[0], logits[1], logits[2] = 1e4, -1e4, -100.0
@@ -94,7 +96,7 @@ def test_weights_of_any_density_and_length_are_those_of_the_closed_form(length: 
 
 
 def weights_of(density: torch.Tensor, length: float) -> torch.Tensor:
-    """Of samples along rays, all of one length."""
+    """Returns the weights of samples that all have the same length."""
     zeros, deltas = torch.zeros(*density.shape, 1), torch.full((*density.shape, 1), length)
     rays = RaySamples(frustums=Frustums(zeros.expand(-1, -1, 3), zeros, zeros, zeros, zeros), deltas=deltas)
     return rays.get_weights(density[..., None])
@@ -118,7 +120,7 @@ def test_density_is_finite_inside_and_outside_of_the_box_and_an_excess_of_it_can
 def test_only_the_exponential_reaches_a_log_range_of_ten(
     brightness: Brightness, least: float, most: float, response: Response
 ):
-    """Numbers in place of the colour network, fitted to differences of a log brightness that is even over the range."""
+    """Free outputs, without a network, are fitted to differences of log brightness that is uniform over the range."""
     torch.manual_seed(0)
     expected = 10.0 * torch.rand(1024)
     outputs = torch.nn.Parameter(torch.zeros(1024))
@@ -134,7 +136,7 @@ def test_only_the_exponential_reaches_a_log_range_of_ten(
 
 
 def test_with_contraction_there_may_be_something_at_any_distance():
-    """Everywhere finite; what is seen in one direction from twice as far is another point; no parameter is added."""
+    """Density is finite everywhere, differs between distances in one direction, and needs no further parameter."""
     torch.manual_seed(0)
     made, bounded = HashDensity(AABB / 2, **GRID, contraction=True), HashDensity(AABB / 2, **GRID)
     torch.nn.init.normal_(made.grid.table)

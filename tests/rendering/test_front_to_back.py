@@ -1,4 +1,4 @@
-"""Samples from the camera on, against Nerfstudio's weights of all of them."""
+"""Rendering from front to back against Nerfstudio's weights of all samples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def samples(num_rays: int):
 @pytest.mark.parametrize("samples_at_once", [None, 16])
 @pytest.mark.parametrize("wall", [0.0, 1e2, 1e5, 1e9, 1e13])
 def test_weights_of_a_veil_before_a_wall_are_nerfstudios(wall: float, samples_at_once: int | None):
-    """Also where the wall is so dense that the veil is lost in their sum."""
+    """Also if the wall is so dense that the veil is lost in the sum of both."""
     along = samples(4)
     veil = torch.tensor([0.0, 0.7, 2.0, 5.0])[:, None, None]
 

@@ -1,3 +1,5 @@
+"""Samplers along rays: both rays of a pair have the same samples; single rays have those of Nerfstudio."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -28,7 +30,7 @@ PAIRS, FRAME_RAYS = 5, 4
 
 
 def paired_rays(seed: int = 0) -> PairedRayBundle:
-    """Both rays of each pair are equal."""
+    """Returns rays of which both rays of each pair are equal."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(PAIRS + FRAME_RAYS, 3, generator=generator), dim=-1)
     directions = torch.cat([directions[:PAIRS], directions])
@@ -46,7 +48,7 @@ def paired_rays(seed: int = 0) -> PairedRayBundle:
 
 
 def density(positions: Tensor) -> Tensor:
-    """A ball around the origin."""
+    """The density of a ball around the origin."""
     return torch.exp(-8.0 * positions.norm(dim=-1, keepdim=True))
 
 
@@ -92,7 +94,7 @@ def test_rays_that_are_no_pairs_differ(sample):
 @pytest.mark.parametrize("single_jitter", [False, True])
 @pytest.mark.parametrize("training", [False, True])
 def test_samples_of_single_rays_are_those_of_nerfstudio(training: bool, single_jitter: bool):
-    """By the same random numbers, from one density to another."""
+    """The same random numbers give the same samples."""
     rays = replace(paired_rays(), num_pairs=0)
     found, expected = [], []
     for paired, samples in ((True, found), (False, expected)):
@@ -139,7 +141,7 @@ def test_the_number_of_pairs_survives_collider_slice_and_device():
 
 @pytest.mark.parametrize("training", [False, True])
 def test_rays_start_at_the_near_plane_and_end_at_the_box(training: bool):
-    """A ray from the middle of the box, one from outside it, and one that misses it."""
+    """One ray starts in the middle of the box, one outside, and one misses the box."""
     rays = RayBundle(
         origins=torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 5.0, 0.0]]),
         directions=torch.tensor([[0.0, 0.0, 1.0]]).repeat(3, 1),
@@ -167,7 +169,7 @@ def test_rays_that_say_where_they_end_do_so_within_the_box():
 
 @pytest.mark.parametrize("pairs", [0, PAIRS])
 def test_the_proposal_network_is_asked_along_one_ray_of_a_pair(pairs: int):
-    """And says the same of both, as far as they go through the same space; else as Nerfstudio's sampler."""
+    """Both rays of a pair use its densities. All else is as with Nerfstudio's sampler."""
     rays = replace(paired_rays(), num_pairs=pairs)
     asked = []
 

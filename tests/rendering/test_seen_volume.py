@@ -1,4 +1,4 @@
-"""What was seen, and where events came from: against a slow loop, and before a wall."""
+"""Seen voxels and the places of events, against slow loops and in front of a wall."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from nerfstudio.model_components.scene_colliders import NearFarCollider
 from small_runs import set_up, small_config
 
 from enerf_ns.method.model import BoxCollider
-from enerf_ns.rendering.seen_volume import STEPS_A_VOXEL, SeenVolume, around, counts, numbers_of, passed, voxels_of
+from enerf_ns.rendering.seen_volume import (
+    STEPS_A_VOXEL,
+    SeenVolume,
+    grid_shape,
+    points_per_voxel,
+    sum_of_neighbours,
+    voxel_indices,
+    voxels_on_rays,
+)
 
 WALL = 0.3
 
 
 class WallModel:
-    """An endless wall at y = 0.3 of the scene, which all rays hit that look its way."""
+    """A model of an infinite wall at y = 0.3 of the scene. All rays that look towards it hit it."""
 
     def __init__(self, aabb: torch.Tensor, collider: Any):
         self.scene_box, self.collider, self.training = SceneBox(aabb), collider, True
@@ -90,7 +98,7 @@ def test_voxels_passed_are_those_that_a_loop_over_exact_chords_finds():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     begins, ends = generator.uniform(0, 0.5, (number, 1)), generator.uniform(0.5, 2.5, (number, 1))
     tensors = [torch.from_numpy(column).float() for column in (origins, directions, begins, ends)]
-    found = passed(aabb, shape, *tensors).numpy()
+    found = voxels_on_rays(aabb, shape, *tensors).numpy()
 
     longest, voxel = np.zeros(tuple(shape)), 2.0 / 16
     low = aabb[0].numpy()
@@ -114,9 +122,9 @@ def test_counts_and_their_surroundings_are_those_of_a_loop():
     for point in points.numpy():
         if (point >= 0).all() and (point < [4, 2, 3]).all():
             expected[tuple(point.astype(int))] += 1
-    found = counts(aabb, shape, points)
+    found = points_per_voxel(aabb, shape, points)
     np.testing.assert_array_equal(found.numpy(), expected)
-    smoothed = around(found).numpy()
+    smoothed = sum_of_neighbours(found).numpy()
     for x, y, z in np.ndindex(*shape):
         near = expected[max(x - 1, 0) : x + 2, max(y - 1, 0) : y + 2, max(z - 1, 0) : z + 2]
         assert smoothed[x, y, z] == pytest.approx(near.sum(), rel=1e-5)
@@ -124,8 +132,8 @@ def test_counts_and_their_surroundings_are_those_of_a_loop():
 
 def test_voxels_are_about_cubes_and_what_is_no_number_lies_in_none():
     aabb = torch.tensor([[-1.0, -0.5, -0.01], [1.0, 0.5, 0.01]])
-    assert voxels_of(aabb) == (64, 32, 1)
-    _, inside = numbers_of(
-        aabb, voxels_of(aabb), torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0, 0, 0]])
+    assert grid_shape(aabb) == (64, 32, 1)
+    _, inside = voxel_indices(
+        aabb, grid_shape(aabb), torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0, 0, 0]])
     )
     assert inside.tolist() == [False, False, True]

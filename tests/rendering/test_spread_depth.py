@@ -1,4 +1,4 @@
-"""Depth spread over plain regions, against planes whose depth is known, and the evidence that it starts from."""
+"""Depth spread over untextured regions against planes of known depth, and the evidence that it starts from."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEIGHT, WIDTH = 40, 60
 
 
 def slanted_plane() -> torch.Tensor:
-    """Depths of a plane, metres; their inverses are even."""
+    """Returns depths of a plane, in metres; their inverses are linear in the pixel."""
     x = torch.linspace(0.0, 1.0, WIDTH).expand(HEIGHT, WIDTH)
     return (1.0 / (0.5 - 0.1 * x))[..., None]
 
@@ -35,7 +35,7 @@ def test_what_is_known_at_some_pixels_of_a_plane_is_spread_over_all_of_it():
 
 @pytest.mark.parametrize("edge", ["brightness", "depth"])
 def test_depth_is_not_spread_over_edges(edge: str):
-    """A near wall, known, beside a far one of which little is known."""
+    """A near wall of known depth stands beside a far wall of low confidence."""
     left = (torch.arange(WIDTH) < WIDTH // 2).expand(HEIGHT, WIDTH)[..., None]
     truth = torch.where(left, 2.0, 2.1 if edge == "brightness" else 3.0)
     brightness = torch.where(left, 0.1, 0.9) if edge == "brightness" else torch.full_like(truth, 0.5)
@@ -67,7 +67,7 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 class Everywhere:
-    """Events came from everywhere alike."""
+    """A seen volume with the same evidence everywhere."""
 
     def __init__(self, evidence: float):
         self._evidence = evidence
@@ -80,7 +80,7 @@ class Everywhere:
 def test_the_evidence_of_even_fog_is_that_of_its_closed_form(
     pipeline: Any, monkeypatch: pytest.MonkeyPatch, evidence: float
 ):
-    """Of light that falls as exp(-density t): what is left at both ends of the stretch around the depth."""
+    """Transmittance is exp(-density t). The evidence is its difference over the range around the depth."""
     model, density = pipeline.model, 3.0
     monkeypatch.setattr(model, "_samples", lambda rays: (PairedUniformSampler(num_samples=4096).eval()(rays), [], []))
     monkeypatch.setattr(model.field.geometry, "forward", lambda x: (torch.full_like(x[..., :1], density), x))
