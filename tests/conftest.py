@@ -1,20 +1,40 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from warm_commands import WarmCommands
 
 # without a GPU, kernels of Triton run as NumPy; Triton reads this when it is imported
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
 
+SWEEP_SEED = "ENERF_SWEEP_SEED"
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
     parser.addoption("--exhaustive", action="store_true", help="run all tests, sweeps in full too")
+    parser.addoption("--sweep-seed", type=int, help="draw the parts of sweeps as the run did that printed this seed")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The seed is in the environment, so that all workers of a run draw the same parts."""
+    if (seed := config.getoption("--sweep-seed")) is not None:
+        os.environ[SWEEP_SEED] = str(seed)
+    os.environ.setdefault(SWEEP_SEED, str(random.randrange(10**6)))
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    if config.getoption("--exhaustive"):
+        return "sweeps: in full"
+    return f"sweeps: a part of each, drawn with --sweep-seed {os.environ[SWEEP_SEED]}; in full with --exhaustive"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -24,6 +44,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="a sweep in full: run with --exhaustive"))
         elif "slow" in item.keywords and not (exhaustive or config.getoption("--slow")):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+    if not exhaustive:
+        left_out = not_drawn(items, int(os.environ[SWEEP_SEED]))
+        config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+        items[:] = [item for item in items if item not in left_out]
+
+
+def not_drawn(items: list[pytest.Item], seed: int) -> set[pytest.Item]:
+    """Returns the cases of sweeps that are not run: all but as many as the marker of each test says."""
+    sweeps: dict[tuple[str, int], list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        if marker := item.get_closest_marker("sweep"):
+            sweeps[item.nodeid.partition("[")[0], marker.args[0]].append(item)
+    return {
+        item
+        for (test, number), cases in sweeps.items()
+        for item in random.Random(f"{seed} {test}").sample(cases, max(len(cases) - number, 0))
+    }
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -39,6 +76,15 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}; set ENERF_DATA")
     return folder
+
+
+@pytest.fixture(scope="session")
+def warm_commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
+    if not hasattr(os, "fork"):
+        pytest.skip("processes cannot be forked here")
+    commands = WarmCommands(tmp_path_factory.mktemp("printed"))
+    yield commands
+    commands.close()
 
 
 @pytest.fixture

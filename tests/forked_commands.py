@@ -1,8 +1,9 @@
-"""Commands in processes of their own, forked from this program, in which all that they import is there already.
+"""The program of `WarmCommands`: it forks processes of commands, and has imported all that they import.
 
 Each line that it reads is a command as JSON: `program` (enerf or ns-train), `arguments`, `folder`, `environment`,
-`output` (the file that it prints into) and `limit` (seconds, after which it is killed). It answers each with its exit
-code on a line. A process ends as Python would end it, but for the taking apart of all modules, which takes seconds.
+`output` (the file that it prints into) and `limit` (seconds, after which it is killed). It answers each with two lines,
+the number of its process and its exit code. A process ends as Python would end it, but does not take all modules apart,
+which takes seconds.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ def forked() -> dict:
         number = os.fork()
         if not number:
             return command
+        print(number, flush=True)
         signal.signal(signal.SIGALRM, lambda *_: os.kill(number, signal.SIGKILL))  # noqa: B023
         signal.alarm(command["limit"])
         code = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])

@@ -40,7 +40,7 @@ def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[
 
 
 @pytest.mark.timeout(2400)
-@pytest.mark.parametrize("kills", [8, pytest.param(50, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("kills", [4, pytest.param(50, marks=pytest.mark.exhaustive)])
 def test_nothing_is_lost_or_half_written_where_processes_are_killed(recording: Path, tmp_path: Path, kills: int):
     """Each at random moments, spread over the whole time that it takes. The next start works, what was left is gone
     then, and a run that goes on ends with the weights of one that was never killed."""
@@ -53,6 +53,7 @@ def test_files_that_cannot_grow_leave_nothing_half_written(recording: Path, tmp_
     assert number.keys() == KINDS and min(number.values()) >= 3
 
 
+@pytest.mark.exhaustive
 def test_full_disks_leave_nothing_half_written(recording: Path, tmp_path: Path):
     disk = tmp_path / "tried"
     disk.mkdir()

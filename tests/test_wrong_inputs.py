@@ -13,7 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,6 +29,7 @@ import test_fuzz
 import test_tum_vie
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
+from warm_commands import WarmCommands
 
 from enerf_ns.dataparsers.recording.errors import printable
 
@@ -203,33 +204,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return write
 
 
-@pytest.fixture(scope="module")
-def forks() -> Iterator[subprocess.Popen[str]]:
-    """The program whose forks are the processes of the commands: each would take seconds to start otherwise."""
-    if not hasattr(os, "fork"):
-        pytest.skip("processes cannot be forked here")
-    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}
-    program = [sys.executable, str(Path(__file__).with_name("forked_commands.py"))]
-    with subprocess.Popen(
-        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **one_thread}
-    ) as process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
-
-
 @pytest.fixture
-def refused(forks: subprocess.Popen[str], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def refused(warm_commands: WarmCommands) -> Callable[..., str]:
     """Calls a command in a process of its own, in the folder of the test; the sentence that it ends with."""
 
     def call(*arguments: object) -> str:
-        program, *rest = map(str, arguments)
-        printed = tmp_path_factory.mktemp("printed") / "output"
-        told = {"program": program, "arguments": rest, "folder": os.getcwd(), "environment": dict(os.environ)}
-        assert forks.stdin is not None and forks.stdout is not None
-        forks.stdin.write(json.dumps({**told, "output": str(printed), "limit": 60}) + "\n")
-        forks.stdin.flush()
-        code, output = int(forks.stdout.readline()), printed.read_text(errors="replace")
+        code, output = warm_commands.run(*arguments)
         assert code == 1, output
         return check_sentence(output)
 
@@ -240,6 +220,7 @@ def output_of(command: str) -> tuple[str, str]:
     return ("--output", "page.html") if command == "inspect" else ("--output-dir", "new")
 
 
+@pytest.mark.sweep(150)
 @pytest.mark.parametrize("name", CASES)
 def test_a_wrong_input_is_refused_in_one_sentence(name, whole, refused, tmp_path, monkeypatch):
     wrong = CASES[name]
@@ -310,6 +291,7 @@ def program_of(arguments: tuple[str, ...]) -> str:
     return "ns-train" if arguments[0] == "enerf" else "enerf"
 
 
+@pytest.mark.sweep(36)
 @pytest.mark.parametrize(("flag", "place"), place_cases())
 def test_a_place_where_nothing_can_be_is_refused(flag: str, place: str, home: Path, refused):
     before = tree(home)
@@ -392,6 +374,7 @@ FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
 """Values out of the range of a flag, or of no use there, and the flag."""
 
 
+@pytest.mark.sweep(36)
 @pytest.mark.parametrize("name", FLAGS)
 def test_a_wrong_flag_is_refused_in_one_sentence(name: str, home: Path, refused):
     arguments, flag = FLAGS[name]
@@ -421,6 +404,7 @@ INTO: dict[str, tuple[str, ...]] = {
 """Every command that writes."""
 
 
+@pytest.mark.sweep(12)
 @pytest.mark.parametrize("place", ["recording/new", "recording/images", "link/images/deep/new"])
 @pytest.mark.parametrize("command", INTO)
 def test_nothing_is_written_into_a_recording(command: str, place: str, home: Path, refused):
@@ -445,6 +429,7 @@ def child(*command: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run([program, *command[1:]], capture_output=True, text=True, timeout=200, **options)
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.slow
 @pytest.mark.parametrize(("program", "name"), CHILDREN)
 def test_a_wrong_input_is_refused_by_the_command_itself(program, name, whole, tmp_path):

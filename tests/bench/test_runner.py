@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from small_runs import SMALL_BENCH
+from warm_commands import WarmCommands
 
 from enerf_ns.bench import runner
 from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
@@ -152,20 +152,20 @@ def test_a_bench_that_is_stopped_between_rows_and_inside_of_one_ends_with_the_sa
 
 @pytest.mark.slow
 def test_a_bench_that_is_killed_between_rows_and_inside_of_them_ends_with_the_same_table(
-    finished: Path, tmp_path: Path
+    finished: Path, tmp_path: Path, warm_commands: WarmCommands
 ):
     """Killed while it simulates, while the first row is trained, and once that is finished."""
-    command = [sys.executable, "-c", "from enerf_ns.scripts.cli import entrypoint; entrypoint()", "bench", "design"]
-    command += ["--budget", "2", "--scale", "0.05", "--threads", "1", "--output-dir", str(tmp_path)]
-    command += ["--rows", *SMALL_BENCH["rows"]]
+    command = ["enerf", "bench", "design", "--budget", "2", "--scale", "0.05", "--threads", "1"]
+    command += ["--output-dir", str(tmp_path), "--rows", *SMALL_BENCH["rows"]]
     for pattern in ("recordings/.*/*", "runs/*/*/*/config.yml", "runs/*/*/*/result.json"):
-        process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
+        started = warm_commands.start(*command, limit=300)
         while not list(tmp_path.glob(pattern)):
-            assert process.poll() is None, f"it ended before there was {pattern}"
+            assert started.running(), f"it ended before there was {pattern}"
             time.sleep(0.002)
-        process.kill()
-        process.wait()
-    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        started.kill()
+        assert started.wait()[0] == -signal.SIGKILL
+    code, printed = warm_commands.run(*command, limit=300)
+    assert code == 0, printed
     assert table(tmp_path) == table(finished)
 
 

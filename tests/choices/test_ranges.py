@@ -22,6 +22,8 @@ from enerf_ns.choices.ranges import RANGES, check_ranges
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.method.config import enerf
 from enerf_ns.method.trainer import EnerfTrainerConfig
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 METHODS = {name: all_methods[name] for name in ("enerf", "enerf-paper", *PUBLISHED_LOSSES)}
@@ -150,6 +152,7 @@ def test_every_number_of_a_config_has_a_range():
     assert all(math.isfinite(lowest) and lowest < highest < math.inf for lowest, highest in RANGES.values())
 
 
+@pytest.mark.sweep(40)
 @pytest.mark.parametrize("setting", ALL, ids=str)
 def test_a_number_is_refused_outside_its_range_and_nothing_is_written(setting: Setting, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -169,6 +172,7 @@ def test_a_number_is_refused_outside_its_range_and_nothing_is_written(setting: S
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.sweep(40)
 @pytest.mark.parametrize("setting", ALL, ids=str)
 def test_both_ends_of_a_range_are_accepted(setting: Setting):
     lowest, highest = RANGES[setting.name]
@@ -250,8 +254,11 @@ def test_numbers_that_do_not_fit_one_another_are_refused(part: str, changes: dic
         check_ranges(config)
 
 
-def test_a_field_trains_at_the_lowest_of_what_makes_it(recording: Path, tmp_path: Path):
-    config = small_config(recording, tmp_path, data__silent_pairs=1, model__max_res=1)
+def test_a_field_trains_at_the_lowest_of_what_makes_it(tmp_path: Path):
+    """Its pictures are small, since each ray of them is rendered by itself."""
+    recording = tmp_path / "recording"
+    simulate(SimulationSettings("shapes", width=8, height=6, duration=0.1, num_frames=11), recording)
+    config = small_config(recording, tmp_path / "runs", data__silent_pairs=1, model__max_res=1)
     model, manager = config.pipeline.model, config.pipeline.datamanager
     for part in (model, manager):
         for name in ("num_levels", "base_res", "log2_table_size", "hidden_dim", "hidden_dim_colour", "num_features",

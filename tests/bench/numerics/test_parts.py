@@ -49,8 +49,9 @@ def test_errors_are_there_of_each_part_and_the_run_is_as_before(run: Run):
     model = run.pipeline.model
     before = {name: value.clone() for name, value in model.state_dict().items()}
     sampler, proposal = model.sampler, model.proposal
-    rows = by_name(error_of_parts(run))
-    assert len(rows) == len(error_of_parts(run)), "no row twice"
+    found = error_of_parts(run)
+    rows = by_name(found)
+    assert len(rows) == len(found), "no row twice"
     quadrature = [error for (name, unit), error in rows.items() if "samples a ray" in name and unit == "dB"]
     numbers = {*SAMPLES, SMALL["pipeline.model.num_samples"]}
     assert len(quadrature) == len(set(quadrature)) == len(numbers) + 1, "of each number, and even"

@@ -312,6 +312,7 @@ def commands(config: Path, output_dir: Path) -> dict[str, list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("command", ["ns-viewer", "ns-train"])
 def test_a_browser_opens_before_the_scene(trained: Path, command: str, tmp_path: Path):
     """What it shows first is the middle training view, about as much smaller as it is seen from farther away."""
