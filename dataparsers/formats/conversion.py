@@ -1,4 +1,4 @@
-"""Recordings of any format, and event files of cameras' makers, made into recordings of the layout event_recording."""
+"""Converts recordings of any format, and event files of camera makers, into the layout event_recording."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any, Literal
 
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
+from enerf_ns.dataparsers.formats.json_values import open_json
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import partial_of, read_json, write_whole
+from enerf_ns.dataparsers.recording.files import partial_of, write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 
@@ -23,12 +24,12 @@ def convert_recording(source: Path, output_dir: Path, **options: object) -> list
     """Copies all events, poses, frames and depth of a recording into a new folder of the layout event_recording.
 
     Args:
-        source: Folder of a recording of any registered format; only read.
-        output_dir: New or empty folder, which is whole afterwards or not there.
-        options: Of the format, by name.
+        source: Folder of a recording of any registered format; it is only read.
+        output_dir: New or empty folder. After an error it is as before.
+        options: Options of the format, by name.
 
     Returns:
-        What was found, and what is left out, in sentences.
+        Sentences that state what was written and what was left out.
 
     Raises:
         RecordingError: The recording cannot be used.
@@ -43,11 +44,11 @@ def write_recording(recording: EventRecording, folder: Path) -> list[str]:
     """Writes a recording as `event_recording.write` does.
 
     Args:
-        recording: Of any format.
-        folder: Exists and is empty.
+        recording: A recording of any format.
+        folder: An empty folder.
 
     Returns:
-        What was found, and what is left out, in sentences.
+        Sentences that state what was written and what was left out.
     """
     num_events = event_recording.write(recording, folder)
     num_poses = len(recording.trajectory.times)
@@ -69,18 +70,18 @@ def convert_event_file(
     poses_unit: Literal["s", "us", "ns"] = "s",
     camera: Path | None = None,
 ) -> list[str]:
-    """Writes the events of a file into a new folder of the layout event_recording, with poses and camera if given.
+    """Writes the events of a file, with poses and camera if given, into a new folder of the layout event_recording.
 
     Args:
-        source: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4; only read.
-        output_dir: New or empty folder, which is whole afterwards or not there.
-        poses: Text file, t px py pz qx qy qz qw a line, on the clock of the event file; camera to world, OpenCV axes,
-            metres.
-        poses_unit: Of the times in it.
+        source: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4; it is only read.
+        output_dir: New or empty folder. After an error it is as before.
+        poses: Text file with lines t px py pz qx qy qz qw, on the clock of the event file; camera to world, OpenCV
+            axes, metres.
+        poses_unit: Unit of the times in the file of poses.
         camera: JSON file with width, height, model, fx, fy, cx, cy and distortion.
 
     Returns:
-        What was found, and what must be added before training, in sentences.
+        Sentences that state what was written, and what must be added before training.
 
     Raises:
         RecordingError: A file cannot be used, or they do not fit together.
@@ -117,14 +118,14 @@ def convert_event_file(
 
 
 def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
-    """What recording.json is to say about the camera: all of its file, or the size of the sensor."""
+    """Returns the camera for recording.json: the content of the file, or only the size of the sensor."""
     if path is None:
         if file.size is None:
             raise RecordingError(
                 f"{file.path} does not state the size of its sensor; give a --camera file with width and height."
             )
         return {"width": file.size[0], "height": file.size[1]}
-    camera = event_recording.parse_camera(path, "camera", read_json(path))
+    camera = event_recording.parse_camera(open_json(path))
     if file.size not in (None, (camera.width, camera.height)):
         raise RecordingError(
             f"{path} is the calibration of {camera.width} x {camera.height} pixels, but {file.path} states a sensor of "
@@ -135,7 +136,7 @@ def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
 
 @contextmanager
 def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
-    """A folder to write into that becomes the output at the end of the block, if nothing fails there."""
+    """Yields a temporary folder, which becomes the output at the end of the block if no error occurs."""
     check_outside_recordings("--output-dir", output_dir, source)
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(

@@ -22,29 +22,29 @@ from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_size, image_size, of_file, reading
+from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file, reading
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events.txt", "groundtruth.txt", "calib.txt")
 
 DAVIS240C_SIZE = (240, 180)
-"""Width and height of the sensor in pixels, where there are no frames to tell."""
+"""Width and height of the sensor in pixels, if there are no frames that state them."""
 
 EVENT_COLUMNS = "t_s x y p"
 BYTES_AT_A_TIME = 2**22
 
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     The recording's zero of time is the earliest first stamp among events, frames and poses.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, or anything in it cannot be used.
+        RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     events_file = folder / "events.txt"
@@ -55,8 +55,7 @@ def read(folder: Path) -> EventRecording:
     num_bytes = events_file.stat().st_size
 
     width, height = image_size(frame_files[0]) if frame_files else DAVIS240C_SIZE
-    for frame_file in frame_files:
-        check_image_size(frame_file, width, height)
+    check_image_sizes(frame_files, width, height)
     camera = _read_camera(folder / "calib.txt", width, height)
     trajectory = Trajectory(pose_times - zero, positions, quaternions)
     return EventRecording(
@@ -76,7 +75,7 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
     path = folder / "images.txt"
     if not path.exists():
         if (folder / "images").is_dir():
-            notes.append("There is a folder images/ but no images.txt with the stamps of frames, so that none is used.")
+            notes.append("There is a folder images/ but no images.txt with the stamps of frames, so no frame is used.")
         return (), np.zeros(0, np.int64)
     rows, numbers = read_rows(path, "t_s path")
     files = tuple(folder / row[1] for row in rows)
@@ -91,7 +90,7 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
     found = set(files[0].parent.glob(f"*{files[0].suffix}"))
     unlisted = len(found.difference(files))
     if unlisted:
-        notes.append(f"{unlisted} of {len(found)} images are not listed in images.txt, so that they are not used.")
+        notes.append(f"{unlisted} of {len(found)} images are not listed in images.txt and are not used.")
     return files, parse_times(path, [row[0] for row in rows], numbers, "s")
 
 
@@ -115,7 +114,7 @@ def _first_event_time(path: Path) -> int:
 
 
 def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
-    """The events of the first bytes of the file, times in nanoseconds from `zero`."""
+    """Yields the events in the first `num_bytes` bytes of the file, times in nanoseconds from `zero`."""
     text = np.memmap(path, np.uint8, mode="r")[:num_bytes]
     end = len(text)
     while end and text[end - 1] in b" \t\r\n":
@@ -154,9 +153,9 @@ def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:
 
 
 def _parse_lines(text, t, x, y, p):
-    """Fills one row per line of `text` (ASCII bytes), and returns how many it filled: fewer than len(t) at a bad line.
+    """Fills one row for each line of `text` (ASCII bytes), and returns the number of rows before the first bad line.
 
-    Numbers may have a sign, a decimal point and an exponent. Times become nanoseconds exactly, with no float between.
+    Numbers may have a sign, a decimal point and an exponent. Times become exact nanoseconds, without floats.
     """
     i = 0
     for row in range(len(t)):

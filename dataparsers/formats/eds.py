@@ -1,23 +1,23 @@
-"""Reader of EDS, as it is unpacked and as E-NeRF's reference code prepares it, and writer of the former.
+"""Reader of EDS, as it is unpacked or as E-NeRF's reference code prepares it; and writer of EDS as it is unpacked.
 
-As unpacked, on a clock of absolute times:
+As unpacked, with absolute times:
 
     events.h5                         x, y, t (µs), p
     stamped_groundtruth.txt           t_s px py pz qx qy qz qw; event camera to world, OpenCV axes, metres
     images/*.png                      of the RGB camera, with images_timestamps.txt, one stamp (µs) a line (optional)
     *camchain*.yaml                   Kalibr's calibration, here or in a calibration folder beside this one (optional)
 
-As prepared, on a clock that starts with the recording:
+As prepared, with times from the start of the recording:
 
     events.h5                         x, y, t (µs), p
     stamped_groundtruth_us.txt        as above, with t_us
-    rectify_map_calib0.h5             rectify_map (480, 640, 2): undistorted place of each pixel of the event camera
+    rectify_map_calib0.h5             rectify_map (480, 640, 2): place of each event pixel in the undistorted image
     calib_undist_calib0.json          intrinsics_undistorted of the RGB and of the event camera
     images_undistorted_calib0/*.png   with images_timestamps_us.txt (optional)
 
-The preparation writes into the unpacked folder and converts events.h5 in place, so that both layouts may lie in one
-folder: what is on the clock of the events is used. The published files do not tell to which part of the exposure the
-stamp of an image belongs; it is taken for the middle.
+The preparation writes into the unpacked folder and converts events.h5 in place, so that one folder may hold both
+layouts. The reader uses the files that are on the clock of the events. The published files do not state to which part
+of the exposure the stamp of an image belongs. The reader takes it as the middle.
 
 Hidalgo-Carrió et al., "Event-aided direct sparse odometry", CVPR 2022.
 """
@@ -25,7 +25,6 @@ Hidalgo-Carrió et al., "Event-aided direct sparse odometry", CVPR 2022.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +32,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
-from enerf_ns.dataparsers.formats.json_values import parse_array
+from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectified_camera
+from enerf_ns.dataparsers.formats.json_values import Value, open_json
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
-from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
+from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import (
-    check_image_size,
-    check_is_folder,
-    in_colour,
-    of_file,
-    read_json,
-    read_text,
-)
+from enerf_ns.dataparsers.recording.files import check_image_sizes, in_colour, read_text
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -60,13 +53,13 @@ RAW_IMAGES, PREPARED_IMAGES = "images", "images_undistorted_calib0"
 STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
 
 CLOCK_START = 1000 * 10**9
-"""What the clock of a recording that is written shows (ns) when the simulation's is at 0."""
+"""Time (ns) in the files of a written recording at the simulation's time 0."""
 
 OFFSET_TOLERANCE = 2000
-"""Nanoseconds by which the preparation may round a time."""
+"""Largest rounding of a time by the preparation, nanoseconds."""
 
 KALIBR_MODELS: dict[str, CameraModel] = {"radtan": "radtan", "equidistant": "fisheye", "none": "pinhole"}
-"""This package's names of the distortion models, by Kalibr's."""
+"""Camera models of this package by Kalibr's name of the distortion model."""
 
 PUBLISHED_RGB_CAMERA = Camera(
     *SENSOR_SIZE,
@@ -88,31 +81,30 @@ PUBLISHED_EXTRINSICS = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-"""Pose of the RGB camera in the axes of the event camera; with the two published cameras, EDS's calibration, for when
-none is there."""
+"""Pose of the RGB camera in the axes of the event camera, metres. It and the two cameras above are the published
+calibration of EDS, which is used if a recording has none."""
 
 Poses = tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]
 """Times (ns), positions and quaternions of poses."""
 
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
-    The recording's zero of time is the earliest first stamp among events, frames and poses as unpacked, and that of the
-    files as prepared.
+    As unpacked, the recording's zero of time is the earliest first stamp among events, frames and poses. As prepared,
+    it is the zero of the files.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, anything in it cannot be used, or the files share no clock.
+        RecordingError: A file is missing, empty or cannot be used, or the files share no clock.
     """
     notes: list[str] = []
     events = Hdf5Events(folder / "events.h5")
     prepared, (pose_times, positions, quaternions) = _read_poses(folder, events, notes)
     image_files, image_times = _read_image_list(folder, prepared, events, notes)
-    first_stamps = [events.first_time, pose_times[0], *image_times[:1]]
-    zero = 0 if prepared else int(min(first_stamps))
+    zero = 0 if prepared else int(min(events.first_time, pose_times[0], *image_times[:1]))
     trajectory = Trajectory(pose_times - zero, positions, quaternions)
 
     camchain = _find_camchain(folder)
@@ -122,26 +114,21 @@ def read(folder: Path) -> EventRecording:
     rectify_map_file = folder / "rectify_map_calib0.h5"
     raw_events = not (prepared and rectify_map_file.exists())
     if not raw_events:
-        undistorted = _read_undistorted_camera(folder, 1)
-        places = read_rectify_map(rectify_map_file, *SENSOR_SIZE).astype(float)
-        directions = (places - undistorted.matrix[:2, 2]) / undistorted.matrix[[0, 1], [0, 1]]
-        with of_file(rectify_map_file):
-            camera = replace(undistorted, model="lookup", directions=directions)
+        camera = read_rectified_camera(rectify_map_file, _read_undistorted_camera(folder, 1))
     frames = None
     if image_files:
         if image_files[0].parent.name == PREPARED_IMAGES:
             rgb_camera = _read_undistorted_camera(folder, 0)
-        for file in image_files:
-            check_image_size(file, rgb_camera.width, rgb_camera.height)
+        check_image_sizes(image_files, rgb_camera.width, rgb_camera.height)
         frames = Frames(image_files, image_times - zero, rgb_camera, trajectory.of_mounted(event_from_rgb))
     if frames is not None or raw_events:
         if camchain is None:
             notes.append(
-                f"The published calibration of EDS is used, since no Kalibr camchain (*camchain*.yaml) lies in "
+                f"The published calibration of EDS is used, since there is no Kalibr camchain (*camchain*.yaml) in "
                 f"{folder.name} or in a calibration folder beside it."
             )
         elif camchain.parent != folder:
-            notes.append(f"The calibration is that of {camchain}.")
+            notes.append(f"The calibration is read from {camchain}.")
     return EventRecording(
         path=folder,
         format="eds",
@@ -151,19 +138,17 @@ def read(folder: Path) -> EventRecording:
         event_files=(events.path,),
         frames=frames,
         notes=tuple(notes),
-        locate_event=lambda index: f"{events.path}, event {index + 1}",
         num_events=events.num_events,
     )
 
 
 def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[bool, Poses]:
-    """Whether the events are on the clock of the prepared files, and the poses on this clock."""
+    """Returns whether the events are on the clock of the prepared files, and the poses on this clock."""
     found: dict[Path, Poses] = {}
     notes_of: dict[Path, list[str]] = {}
     for path, unit in ((folder / RAW_POSES, "s"), (folder / PREPARED_POSES, "us")):
         if path.exists():
-            notes_of[path] = []
-            found[path] = read_poses(path, unit, notes_of[path])
+            found[path] = read_poses(path, unit, notes_of.setdefault(path, []))
     if not found:
         raise RecordingError(
             f"{folder} holds neither {RAW_POSES} (t_s px py pz qx qy qz qw) nor {PREPARED_POSES}, which hold the poses "
@@ -177,70 +162,64 @@ def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[boo
         both = all(_overlap(events, rows) > 0 for rows in times.values())
         if both and raw_times[0] > prepared_times[-1]:
             raise RecordingError(
-                f"{events.path} holds times of {RAW_POSES} and of {PREPARED_POSES} in one, as a preparation that "
-                "was interrupted leaves them; unpack it again."
+                f"{events.path} holds times of the clock of {RAW_POSES} and of {PREPARED_POSES}, as an interrupted "
+                "preparation leaves them; unpack it again."
             )
-        notes.append(
-            f"{RAW_POSES} and {PREPARED_POSES} are there; {best.name} is on the clock of events.h5 and is used."
-        )
+        notes.append(f"Of {RAW_POSES} and {PREPARED_POSES}, {best.name} is used, which is on the clock of events.h5.")
     notes += notes_of[best]
     return best.name == PREPARED_POSES, found[best]
 
 
 def _check_offset(folder: Path, offset: int) -> None:
+    """Checks the time (ns) between both tables of poses against the offset that the preparation noted."""
     path = folder / "t_offset_us.txt"
     if path.exists():
         stated = int(read_times(path, "us")[0])
         if abs(stated - offset) > OFFSET_TOLERANCE:
             raise RecordingError(
                 f"{path} states {stated / 1000:.0f} µs between {RAW_POSES} and {PREPARED_POSES}, but their first times "
-                f"are {offset / 1000:.0f} µs apart; remove those that are not of this recording."
+                f"are {offset / 1000:.0f} µs apart; remove the files of another recording."
             )
 
 
 def _read_image_list(
     folder: Path, prepared: bool, events: Hdf5Events, notes: list[str]
 ) -> tuple[tuple[Path, ...], Int64[np.ndarray, " images"]]:
-    """The images that are used, and their stamps on the clock of the events."""
-    folders = [folder / RAW_IMAGES, folder / PREPARED_IMAGES]
-    for path in folders:
-        check_is_folder(path, "a folder of frames")
-    folders = [path for path in (reversed(folders) if prepared else folders) if path.is_dir()]
-    images = [tuple(sorted(path.glob("*.png")) or sorted(path.glob("*.jpg"))) for path in folders]
-    files: tuple[Path, ...] = next(filter(None, images), ())
+    """Returns the images that are used, and their stamps on the clock of the events."""
+    images = {folder / name: images_in(folder / name) for name in (RAW_IMAGES, PREPARED_IMAGES)}
+    images = {path: files for path, files in images.items() if path.is_dir()}
+    of_clock, other = (PREPARED_IMAGES, RAW_IMAGES) if prepared else (RAW_IMAGES, PREPARED_IMAGES)
+    place = next((folder / name for name in (of_clock, other) if images.get(folder / name)), next(iter(images), None))
     stamps = {folder / name: read_times(folder / name, "us") for name in STAMPS if (folder / name).exists()}
-    if not files and not stamps:
-        return (), np.zeros(0, np.int64)
-    if not folders:
-        notes.append(f"There are stamps of images, but no folder {RAW_IMAGES}/ or {PREPARED_IMAGES}/ with these.")
+    if place is None or not (images[place] or stamps):
+        if stamps:
+            notes.append(
+                f"There are stamps of images, but no folder {RAW_IMAGES}/ or {PREPARED_IMAGES}/, so no frame is used."
+            )
         return (), np.zeros(0, np.int64)
     if not stamps:
         raise RecordingError(
-            f"{folder} holds {len(files):,} images, but {' and '.join(STAMPS)} are missing, one of which "
-            "holds their stamps (t_us); add it."
+            f"{folder} holds {len(images[place]):,} images, but {' and '.join(STAMPS)} are missing; add the one that "
+            "holds their stamps (t_us)."
         )
     path = _on_the_clock_of(events, stamps)
-    if len(stamps[path]) != len(files):
-        raise RecordingError(
-            f"{files[0].parent if files else folders[0]} holds {len(files):,} images, but {path} holds "
-            f"{len(stamps[path]):,} stamps; give one each."
-        )
-    return files, stamps[path]
+    check_one_each(place, len(images[place]), path, len(stamps[path]), "stamps")
+    return images[place], stamps[path]
 
 
 def _overlap(events: Hdf5Events, times: Int64[np.ndarray, " rows"]) -> int:
-    """For how many ns there are both events and these times; below 0, how far they are apart."""
+    """Returns for how many ns there are both events and these times, or minus the time between both."""
     return int(min(times[-1], events.last_time) - max(times[0], events.first_time))
 
 
 def _on_the_clock_of(events: Hdf5Events, tables: dict[Path, Int64[np.ndarray, " rows"]]) -> Path:
-    """The file whose times (ns) overlap most with those of the events."""
+    """Returns the file whose times (ns) overlap most with the times of the events."""
     best = max(tables, key=lambda path: _overlap(events, tables[path]))
     if _overlap(events, tables[best]) < 0:
         ranges = " and ".join(f"{path.name} times from {_span(rows[0], rows[-1])}" for path, rows in tables.items())
         raise RecordingError(
             f"{best.parent} holds {ranges}, but events.h5 times from {_span(events.first_time, events.last_time)}; "
-            f"they must be on one clock, in µs but for {RAW_POSES}, which is in seconds."
+            f"they must be on one clock, in µs except {RAW_POSES}, which is in seconds."
         )
     return best
 
@@ -250,38 +229,30 @@ def _span(first: int, last: int) -> str:
 
 
 def _find_camchain(folder: Path) -> Path | None:
-    """The first camchain in the folder or, without one, in the calibration folders beside it."""
+    """Returns the first camchain in the folder or, without one, in the calibration folders beside it."""
     places = [folder, *sorted(folder.parent.glob("*[cC]alib*/")), *sorted(folder.parent.glob("*[cC]alib*/*/"))]
     return next((path for place in places for path in sorted(place.glob("*camchain*.yaml"))), None)
 
 
 def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
-    """The RGB camera, the event camera, and the pose of the first in the axes of the second."""
+    """Returns the RGB camera, the event camera, and the pose of the RGB camera in the axes of the event camera."""
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        """Reads 1e-05 as a number. YAML 1.1 takes it for text."""
+
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"])
     text = read_text(path, "a Kalibr camchain")
     try:
-        camchain = yaml.safe_load(text)
+        camchain = Value(path, yaml.load(text, Loader))
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}," if mark else ""
         raise RecordingError(f"{path}{line} cannot be read as YAML, but a Kalibr camchain was expected.") from error
-    if not isinstance(camchain, dict) or not all(isinstance(camchain.get(name), dict) for name in ("cam0", "cam1")):
-        raise RecordingError(
-            f"{path} holds no cam0 and cam1, but the RGB and the event camera of a Kalibr camchain were expected."
-        )
-    cameras = {name: _kalibr_camera(path, name, camchain[name]) for name in ("cam0", "cam1")}
-    cam1_from_cam0 = _numbers(path, "cam1", camchain["cam1"], "T_cn_cnm1", (4, 4))
-    try:
-        check_rotation(cam1_from_cam0[:3, :3])
-    except ValueError as error:
-        raise RecordingError(f"{path} holds T_cn_cnm1 of cam1, whose rotation {error}; calibrate again.") from error
-    if not np.allclose(cam1_from_cam0[3], [0, 0, 0, 1]):
-        raise RecordingError(f"{path} holds T_cn_cnm1 of cam1, whose last row must be 0 0 0 1; calibrate again.")
-    if _event_camera(path, text, camchain) == "cam1":
-        rgb_camera, camera, event_from_rgb = cameras["cam0"], cameras["cam1"], cam1_from_cam0
-    else:
-        rgb_camera, camera, event_from_rgb = cameras["cam1"], cameras["cam0"], np.linalg.inv(cam1_from_cam0)
+    rgb_camera, camera = (_kalibr_camera(camchain[name]) for name in ("cam0", "cam1"))
+    event_from_rgb = camchain["cam1"]["T_cn_cnm1"].pose()
+    if _event_camera(text, camchain) == "cam0":
+        rgb_camera, camera, event_from_rgb = camera, rgb_camera, np.linalg.inv(event_from_rgb)
     if (camera.width, camera.height) != SENSOR_SIZE:
         raise RecordingError(
             f"{path} calibrates an event camera of {camera.width} x {camera.height} pixels, but that of EDS has "
@@ -290,86 +261,47 @@ def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4
     return rgb_camera, camera, event_from_rgb
 
 
-def _event_camera(path: Path, text: str, camchain: dict) -> str:
-    """cam1, unless comments, topics, or the flip that is of RGB alone, say that it is cam0."""
-    said = set()
+def _event_camera(text: str, camchain: Value) -> str:
+    """Returns cam1, or cam0 if a comment, a topic, or the flip that only RGB has, says so."""
+    named = set()
     for name, other in (("cam0", "cam1"), ("cam1", "cam0")):
         comment = re.search(rf"^{name}:[ \t]*#(.*)$", text, re.MULTILINE)
-        hint = f"{comment[1] if comment else ''} {camchain[name].get('rostopic')}".lower()
+        hint = f"{comment[1] if comment else ''} {camchain.found[name].get('rostopic')}".lower()
         if "event" in hint or "dvs" in hint:
-            said.add(name)
-        if "rgb" in hint or camchain[name].get("flip") is True:
-            said.add(other)
-    if len(said) > 1:
+            named.add(name)
+        if "rgb" in hint or camchain.found[name].get("flip") is True:
+            named.add(other)
+    if len(named) > 1:
         raise RecordingError(
-            f"{path} says both of cam0 and of cam1 that it is the event camera (by comment, rostopic or flip), but one "
-            "is RGB; correct it."
+            f"{camchain.path} names both cam0 and cam1 as the event camera (by comment, rostopic or flip), but one is "
+            "RGB; correct it."
         )
-    return said.pop() if said else "cam1"
+    return named.pop() if named else "cam1"
 
 
-def _kalibr_camera(path: Path, name: str, entry: dict) -> Camera:
-    stated = (entry.get("camera_model"), entry.get("distortion_model"))
-    model, distortion_model = (
-        " ".join(name.lower().split()) if isinstance(name, str) else repr(name) for name in stated
-    )
-    if model != "pinhole" or distortion_model not in KALIBR_MODELS:
-        raise RecordingError(
-            f"{path} holds camera_model {model} with distortion_model {distortion_model} of {name}, but pinhole with "
-            f"one of {', '.join(KALIBR_MODELS)} was expected."
-        )
-    fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", (4,)).tolist()
-    width, height = _numbers(path, name, entry, "resolution", (2,)).tolist()
-    distortion: tuple[float, ...] = ()
-    if distortion_model != "none":
-        distortion = tuple(_numbers(path, name, entry, "distortion_coeffs", (4,)).tolist())
-    with of_file(f"{path}, {name},"):
-        return Camera(width, height, fx, fy, cx, cy, distortion, KALIBR_MODELS[distortion_model])
-
-
-def _numbers(path: Path, name: str, entry: dict, key: str, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        values = np.array(entry.get(key), dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        values = np.zeros(0)
-    is_bool = [isinstance(value, bool) for value in np.array(entry.get(key), dtype=object).flat]
-    if values.shape != shape or not np.isfinite(values).all() or any(is_bool):
-        found = " ".join(str(entry.get(key)).split())[:80]
-        raise RecordingError(
-            f"{path} holds {key}: {found} of {name}, but {' x '.join(map(str, shape))} numbers were expected."
-        )
-    return values
+def _kalibr_camera(entry: Value) -> Camera:
+    entry["camera_model"].choice(("pinhole",))
+    model = KALIBR_MODELS[entry["distortion_model"].choice(KALIBR_MODELS)]
+    intrinsics, size = entry["intrinsics"].numbers((4,)).tolist(), entry["resolution"].numbers((2,)).tolist()
+    distortion = () if model == "pinhole" else entry["distortion_coeffs"].numbers((4,)).tolist()
+    return entry.camera(size, intrinsics, distortion, model)
 
 
 def _read_undistorted_camera(folder: Path, number: int) -> Camera:
-    """RGB (0) or event camera (1) after the preparation."""
-    path = folder / "calib_undist_calib0.json"
-    entries = read_json(path).get("intrinsics_undistorted")
-    try:
-        if not isinstance(entries, list) or len(entries) != 2:
-            raise ValueError("two cameras were expected")
-        fx, fy, cx, cy = parse_array([entries[number][key] for key in ("fx", "fy", "cx", "cy")], (4,)).tolist()
-    except (ValueError, LookupError, TypeError) as error:
-        raise RecordingError(
-            f"{path} holds no intrinsics_undistorted with numbers fx fy cx cy (pixels) of the RGB and the event "
-            "camera; prepare the recording again."
-        ) from error
-    with of_file(path):
-        return Camera(*SENSOR_SIZE, fx, fy, cx, cy)
+    """Returns the RGB camera (0) or the event camera (1) after the preparation."""
+    entry = open_json(folder / "calib_undist_calib0.json")["intrinsics_undistorted"].values(2)[number]
+    return entry.camera(SENSOR_SIZE, entry.each("fx", "fy", "cx", "cy"))
 
 
 class EdsWriter(Writer):
-    """Writer of EDS as it is unpacked. The published files do not state exposures; simulation.json does."""
+    """Writer of EDS as it is unpacked. Only simulation.json states the exposure, since the published files do not."""
 
     layout = "eds"
     start = CLOCK_START
     published_rig = (PUBLISHED_EVENT_CAMERA, PUBLISHED_RGB_CAMERA, PUBLISHED_EXTRINSICS)
 
     def add_events(self, events: Events) -> None:
-        """Adds events up to 1 µs before the last frame, since E-NeRF's loader wants that to be last.
-
-        Else as `Writer.add_events`.
-        """
+        """Adds events up to 1 µs before the last frame, since E-NeRF's loader expects the last frame to be last."""
         until = int(np.searchsorted(events.t, self.setup.frame_times[-1] - 1000))
         super().add_events(Events(events.x[:until], events.y[:until], events.t[:until], events.p[:until]))
 

@@ -1,8 +1,8 @@
-"""Reader and writer of E-NeRF's ESIM sequences, and for what `enerf simulate` writes.
+"""Reader and writer of E-NeRF's ESIM sequences, which is also the default layout of `enerf simulate`.
 
     events/*.npy                (n, 4) x y t_ns p, in time order over the files by name; a fifth column is ignored
     *poses_all*.txt             t_ns px py pz qx qy qz qw after a header line; camera to world, OpenCV axes, metres
-    poses_bounds.npy            (N, 17) rows of LLFF, of which only height, width, focal length and the bounds are used
+    poses_bounds.npy            (N, 17) rows of LLFF; only height, width, focal length and the bounds are used
     images/*.png                sharp frames (or .jpg), with images/image_stamps_ns.txt, one stamp a line (optional)
     images_corrupted/*.png      frames blurred by motion, with an image_stamps_ns.txt of their own (optional)
     depth/*.npy                 (height, width) depth in metres of each frame, 0 where nothing was hit (optional)
@@ -22,12 +22,10 @@ import numpy as np
 import torch
 
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.frame_folders import read_frames
-from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
+from enerf_ns.dataparsers.formats.frame_folders import images_in, read_frames
+from enerf_ns.dataparsers.formats.json_values import open_json
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import (
-    FEWEST_FRAMES,
-    FEWEST_POSES,
     EventFiles,
     GrowingArray,
     Writer,
@@ -37,21 +35,24 @@ from enerf_ns.dataparsers.formats.writer import (
 )
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_folder, in_colour, load_array, of_file, read_json
+from enerf_ns.dataparsers.recording.files import check_is_folder, in_colour, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events/*.npy", "*poses_all*.txt", "poses_bounds.npy")
 
+FEWEST_FRAMES, FEWEST_POSES = 11, 101
+"""Least numbers of frames and poses that the reference code of E-NeRF accepts."""
+
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, or anything in it cannot be used.
+        RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     poses_files = sorted(folder.glob("*poses_all*.txt"))
@@ -68,12 +69,13 @@ def read(folder: Path) -> EventRecording:
     simulation_file = folder / "simulation.json"
     contrast_thresholds, response, exposure = None, None, None
     if simulation_file.exists():
-        simulation = read_json(simulation_file)
-        contrast_thresholds = _two_numbers(simulation_file, simulation, "contrast_thresholds")
-        depth_range = _two_numbers(simulation_file, simulation, "depth_range") or depth_range
-        camera = _simulated_camera(simulation_file, simulation) or camera
-        response = simulation.get("response")
-        exposure = parse_nanoseconds(simulation_file, simulation, "exposure_ns")
+        simulation = open_json(simulation_file)
+        contrast_thresholds = simulation.pair("contrast_thresholds")
+        depth_range = simulation.pair("depth_range") or depth_range
+        if (simulated := simulation.get("camera")) is not None:
+            camera = simulated.camera(simulated.each("width", "height"), simulated.each("fx", "fy", "cx", "cy"))
+        response = simulation.found.get("response")
+        exposure = simulation.nanoseconds("exposure_ns")
 
     num_rows = [_num_rows(file) for file in event_files]
     with of_file(simulation_file):
@@ -98,18 +100,19 @@ def read(folder: Path) -> EventRecording:
 
 
 def _check_numbers(files: list[Path]) -> None:
-    """Where the names of event files count on by one, none is missing between the first and the last."""
+    """Checks that no event file is missing between others, if the names of the files are numbers in turn."""
     if not all(file.stem.isdecimal() for file in files):
         return
     files = sorted(files, key=lambda file: int(file.stem))
     steps = np.diff([int(file.stem) for file in files])
     gaps = np.flatnonzero(steps > 1)
-    if not len(gaps) or 2 * (steps == 1).sum() < len(steps):  # else they do not count on: stamps, or every tenth
+    if not len(gaps) or 2 * (steps == 1).sum() < len(steps):  # such as stamps, or every tenth number
         return
     before, after, missing = files[gaps[0]], files[gaps[0] + 1], int((steps[gaps] - 1).sum())
     raise RecordingError(
-        f"{before.parent} holds {before.name} and then {after.name}, while the names of its {len(files)} files count "
-        f"on by one: {missing} {'is' if missing == 1 else 'are'} missing; copy the events that lack from their source."
+        f"{before.parent} holds {before.name} and then {after.name}, but the names of its {len(files)} files are "
+        f"numbers in turn, so {missing} {'is' if missing == 1 else 'are'} missing; copy them "
+        "from their source."
     )
 
 
@@ -125,36 +128,15 @@ def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
     return camera, (near, far) if 0 < near < far < np.inf else None
 
 
-def _two_numbers(path: Path, simulation: dict, name: str) -> tuple[float, float] | None:
-    if simulation.get(name) is None:
-        return None
-    first, second = parse_numbers(path, name, simulation[name], (2,), "two numbers").tolist()
-    return first, second
-
-
-def _simulated_camera(path: Path, simulation: dict) -> Camera | None:
-    camera = simulation.get("camera")
-    if camera is None:
-        return None
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    if not isinstance(camera, dict):
-        raise RecordingError(f"{path} holds camera = {shown(camera)}, but {', '.join(names)} in pixels were expected.")
-    values = [camera.get(name) for name in names]
-    numbers = parse_numbers(path, f"camera ({', '.join(names)})", values, (6,), "numbers of pixels")
-    with of_file(path):
-        return Camera(*numbers.tolist())
-
-
 def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, exposure: int | None) -> Frames | None:
-    files = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     check_is_folder(folder.parent / "depth", "a folder of depth maps")
     depth_files = sorted((folder.parent / "depth").glob("*.npy"))
-    frames = read_frames(files, folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
+    frames = read_frames(images_in(folder), folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
     return frames and frames.with_exposure(exposure)
 
 
 def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
-    """All events as they are in the files."""
+    """Yields all events as they are in the files."""
     for file, length in zip(files, num_rows, strict=True):
         rows = load_array(file, mmap_mode="r")
         if len(rows) < length:
@@ -164,7 +146,7 @@ def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:
 
 
 def _events(file: Path, rows: np.ndarray, start: int) -> Events:
-    """Events from rows (n, 4) x y t_ns p of any type of number; `start` is the number of the first row in its file."""
+    """Returns the events of rows (n, 4) x y t_ns p of any type; `start` is the number of the first row in its file."""
     limits = (("x", 2**31), ("y", 2**31), ("t", 2**62), ("p", 2**31))
     is_float = rows.dtype.kind == "f"
     for column, (name, limit) in zip(rows.T, limits, strict=False):
@@ -198,13 +180,12 @@ def _locate(files: list[Path], num_rows: list[int], index: int) -> str:
 
 
 class EsimWriter(Writer):
-    """Writer of E-NeRF's ESIM sequences, with one file of events for each frame, up to the next."""
+    """Writer of E-NeRF's ESIM sequences, with one file of events for each frame."""
 
     layout = "esim"
     frame_folders = ("images", "images_corrupted")
     stamps_name = "image_stamps_ns.txt"
     fewest_frames = FEWEST_FRAMES
-    fills_up_poses = True
 
     def _check(self) -> None:
         setup, camera = self.setup, self.setup.event_camera
@@ -219,7 +200,7 @@ class EsimWriter(Writer):
         self._write_bounds()
 
     def _write_bounds(self) -> None:
-        """LLFF's rows [R | t | height width focal], axes down, right and back, and the nearest and farthest depth."""
+        """Writes LLFF's rows [R | t | height width focal] (axes down, right, back), and nearest and farthest depth."""
         camera, trajectory, times = self.setup.event_camera, self.setup.trajectory, self.setup.frame_times
         poses = np.tile(np.eye(3, 4), (len(times), 1, 1))
         if trajectory is not None:
@@ -231,7 +212,7 @@ class EsimWriter(Writer):
         self._replace("poses_bounds.npy", encode_npy(np.column_stack([rows, bounds]), np.float64))
 
     def _write_poses(self, trajectory: Trajectory) -> None:
-        """All poses and, where they are too few, some between them, which leave the interpolated path as it is."""
+        """Writes all poses, and interpolated ones between them if they are fewer than `FEWEST_POSES`."""
         times = trajectory.times
         parts = -(-FEWEST_POSES // (len(times) - 1))
         if len(times) < FEWEST_POSES:
@@ -254,7 +235,10 @@ class EsimWriter(Writer):
 
 
 class IntervalFiles:
-    """One file for each frame, with the events after it up to the next; those before the first are in its file."""
+    """Writer of one file for each frame, with the events from this frame to the next.
+
+    The first file also holds the events before the first frame.
+    """
 
     def __init__(self, paths: list[Path], frame_times: np.ndarray):
         for path in paths:

@@ -6,13 +6,13 @@
         /cam0/camera_info   sensor_msgs/CameraInfo
     esim.conf       the simulator's flags, one a line (optional): contrast_threshold_pos, contrast_threshold_neg,
                     refractory_period_ns and simulate_color_events, which means the Bayer pattern RGGB
-    views/          as of `esim_npz` (optional)
+    views/          as in `esim_npz` (optional)
 
-Stamps are nanoseconds from the simulation's zero. All poses are used: the simulator states where the camera was at each
-sample of its inertial sensor and at each rendered image, both exact. (Robust e-NeRF keeps the former only, which are
-equally spaced, since it interpolates linearly.)
+Stamps are nanoseconds from the simulation's zero. All poses are used: the simulator states the exact pose at each
+sample of its inertial sensor and at each rendered image. Robust e-NeRF uses only the poses of the inertial sensor,
+which are equally spaced, since it interpolates linearly.
 
-To find the poses, the whole bag is read once. What a chunk of it holds is all that is in memory at once.
+The reader reads the whole bag once to find the poses. Only one chunk of the bag is in memory at a time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MESSAGE_TYPES = {
 }
 
 EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("polarity", "u1")])
-"""dvs_msgs/Event as it is serialized: 13 bytes."""
+"""A serialized dvs_msgs/Event: 13 bytes."""
 
 COLOUR = "simulate_color_events"
 
@@ -60,19 +60,19 @@ DEFAULT_FLAGS = {
     "refractory_period_ns": "0",
     COLOUR: "false",
 }
-"""Default flags of the simulator; what esim.conf does not state is this."""
+"""Values that the simulator uses for flags that esim.conf does not state."""
 
 TRUTH = {**dict.fromkeys(("1", "t", "true", "y", "yes"), True), **dict.fromkeys(("0", "f", "false", "n", "no"), False)}
 
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, anything in it cannot be used, or rosbags is not installed.
+        RecordingError: A file is missing, empty or cannot be used, or rosbags is not installed.
     """
     notes: list[str] = []
     path = folder / "esim.bag"
@@ -83,11 +83,13 @@ def read(folder: Path) -> EventRecording:
     if flags_file.exists():
         contrast_thresholds, refractory_period, bayer_pattern = _read_flags(flags_file)
         if flags_file.stat().st_size == 0:
-            notes.append("esim.conf is empty, so that contrast thresholds of 1 are used, as the simulator would.")
+            notes.append(
+                "esim.conf is empty, so contrast thresholds of 1 are used, which are the simulator's defaults."
+            )
     else:
         notes.append(
-            "There is no esim.conf, so that contrast thresholds and refractory period are not known, and the sensor is "
-            "taken to be grey."
+            "There is no esim.conf, so contrast thresholds and refractory period are not known, and the sensor is "
+            "assumed to be grey."
         )
     views = read_views(folder, notes)
     with of_file(flags_file):
@@ -103,12 +105,11 @@ def read(folder: Path) -> EventRecording:
             refractory_period=refractory_period,
             bayer_pattern=bayer_pattern,
             notes=tuple(notes),
-            locate_event=lambda index: f"{path}, event {index + 1}",
         )
 
 
 def _messages(path: Path, topic: str) -> Iterator[Any]:
-    """What was sent on a topic, in order of time: events as they are serialized, anything else as an object."""
+    """Yields the messages of a topic in order of time: events as serialized bytes, other messages as objects."""
     try:
         from rosbags.rosbag1 import Reader
         from rosbags.typesys import Stores, get_typestore
@@ -161,10 +162,10 @@ def _read_camera(path: Path) -> Camera:
 
 
 def _parse_events(path: Path, data: bytes) -> tuple[tuple[int, int], np.ndarray]:
-    """Width and height of the sensor, and its events, from a serialized dvs_msgs/EventArray.
+    """Returns the size of the sensor (width, height) and the events of a serialized dvs_msgs/EventArray.
 
-    Layout: u32 seq, u32 s, u32 ns, u32 length of the name of the frame, the name, u32 height, u32 width, u32 number of
-    events, and the events.
+    Its bytes are u32 seq, u32 s, u32 ns, u32 length of the name of the frame, the name, u32 height, u32 width, u32
+    number of events, and the events.
     """
     try:
         (length,) = struct.unpack_from("<I", data, 12)
@@ -200,7 +201,7 @@ def _joined(held: list[np.ndarray]) -> Events:
 
 
 def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:
-    """Contrast thresholds, refractory period and Bayer pattern from a file of flags, of which the last one counts."""
+    """Returns contrast thresholds, refractory period and Bayer pattern from flags; the last one of a name counts."""
     lines = read_text(path, "flags of ESIM").splitlines()
     flags = dict(DEFAULT_FLAGS)
     for number, line in enumerate(map(str.strip, lines), 1):

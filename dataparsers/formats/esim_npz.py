@@ -1,4 +1,4 @@
-"""Reader for the .npz layout of Robust e-NeRF, into which it brings simulated recordings, TUM-VIE and EDS.
+"""Reader for the .npz layout into which Robust e-NeRF converts simulated recordings, TUM-VIE and EDS.
 
     raw_events.npz              position (N, 2): x y; timestamp (N): ns; polarity (N): true where it became brighter
     camera_poses.npz            T_wc_position (P, 3): metres; T_wc_orientation (P, 4): xyzw; T_wc_timestamp (P): ns;
@@ -11,9 +11,8 @@
                                 with file_path (mostly without .png) and transform_matrix (4, 4): camera to world,
                                 OpenGL axes
 
-Stamps are nanoseconds from the recording's own zero. The views are rendered from other places than those the event
-camera passes, and have no stamps: they serve to evaluate. What views/ holds for training is not read, nor are its depth
-maps.
+Stamps are nanoseconds from the recording's own zero. The views are rendered from places beside the path of the event
+camera, and have no stamps; they serve for evaluation. Training views and depth maps in views/ are not read.
 
 Low and Lee, "Robust e-NeRF: NeRF from sparse & noisy events under non-uniform motion", ICCV 2023;
 https://github.com/wengflow/robust-e-nerf.
@@ -28,11 +27,10 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import numpy as np
-from jaxtyping import Int, Int64
 
+from enerf_ns.dataparsers.formats.columns import check_lengths, check_times
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.robust_enerf import (
-    LATEST,
     checked_camera,
     checked_trajectory,
     listed,
@@ -51,13 +49,13 @@ KINDS = {"integers": "iu", "whole numbers or booleans": "iub", "numbers": "iuf",
 
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, or anything in it cannot be used.
+        RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     events_file, poses_file, calibration_file = (folder / name for name in FILES)
@@ -79,13 +77,12 @@ def read(folder: Path) -> EventRecording:
             refractory_period=refractory_period,
             bayer_pattern=bayer_pattern,
             notes=tuple(notes),
-            locate_event=lambda index: f"{events_file}, event {index + 1}",
             num_events=num_events,
         )
 
 
 class _StoredArray:
-    """An array in an .npz file, read from its first to its last row, and never unpickled."""
+    """An array in an .npz file, which is read from its first to its last row and never unpickled."""
 
     def __init__(self, path: Path, archive: ZipFile, name: str, kind: str, shape: tuple[int | None, ...]):
         if f"{name}.npy" not in archive.namelist():
@@ -96,42 +93,42 @@ class _StoredArray:
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"the array {name} is of version {version} of the format")
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        self.shape, self.by_column, self._dtype = header(self._stream)
-        if self._dtype.hasobject:
+        self.shape, self.by_column, self.dtype = header(self._stream)
+        if self.dtype.hasobject:
             raise RecordingError(
-                f"{path} holds {name} as pickled Python objects, which are never loaded since that can run code; save "
+                f"{path} holds {name} as pickled Python objects, which are never loaded, since they can run code; save "
                 f"it as an array of {kind}."
             )
         fits = len(self.shape) == len(shape) and all(
             size in (None, found) for size, found in zip(shape, self.shape, strict=True)
         )
-        if self._dtype.kind not in KINDS[kind] or not fits:
+        if self.dtype.kind not in KINDS[kind] or not fits:
             expected = "(" + ", ".join("n" if size is None else str(size) for size in shape) + ")"
             raise RecordingError(
-                f"{path} holds {name} as {self._dtype} of shape {self.shape}, but {kind} of shape {expected} were "
+                f"{path} holds {name} as {self.dtype} of shape {self.shape}, but {kind} of shape {expected} were "
                 "expected."
             )
         stored = archive.getinfo(f"{name}.npy").file_size - self._stream.tell()
-        if stored != math.prod(self.shape) * self._dtype.itemsize:
+        if stored != math.prod(self.shape) * self.dtype.itemsize:
             raise EOFError(f"the array {name} of shape {self.shape} does not fill its {stored:,} bytes")
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def rows(self, count: int) -> np.ndarray:
-        """The next rows."""
+        """Returns the next rows."""
         return self._numbers((count, *self.shape[1:]))
 
     def whole(self) -> np.ndarray:
-        """The whole array, at once."""
+        """Returns the whole array."""
         return self._numbers(self.shape)
 
     def close(self) -> None:
         self._stream.close()
 
     def _numbers(self, shape: tuple[int, ...]) -> np.ndarray:
-        data = self._stream.read(math.prod(shape) * self._dtype.itemsize)
-        return np.frombuffer(data, self._dtype).reshape(shape, order="F" if self.by_column else "C")
+        data = self._stream.read(math.prod(shape) * self.dtype.itemsize)
+        return np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.by_column else "C")
 
 
 EXPECTED = "an .npz file of NumPy"
@@ -149,13 +146,10 @@ def _read_trajectory(path: Path, notes: list[str]) -> Trajectory:
         "T_wc_orientation": ("numbers", (None, 4)),
     }
     times, positions, quaternions = _load(path, forms)
-    if not len(times) == len(positions) == len(quaternions):
-        raise RecordingError(
-            f"{path} holds {len(times):,} times, {len(positions):,} positions and {len(quaternions):,} orientations, "
-            "but as many of each were expected."
-        )
+    check_lengths(path, {"times": len(times), "positions": len(positions), "orientations": len(quaternions)})
+    check_times(path, times)
     return checked_trajectory(
-        path, _nanoseconds(path, times), positions.astype(np.float64), quaternions.astype(np.float64), notes
+        path, times.astype(np.int64), positions.astype(np.float64), quaternions.astype(np.float64), notes
     )
 
 
@@ -181,20 +175,17 @@ def _text(array: np.ndarray) -> str:
 
 
 def _open_events(path: Path, stack: ExitStack) -> tuple[_StoredArray, _StoredArray, _StoredArray]:
-    """Positions, times and polarities, open as long as the stack is."""
+    """Returns positions, times and polarities, which stay open until the stack closes."""
+    forms = {"position": (None, 2), "timestamp": (None,), "polarity": (None,)}
+    arrays = []
     with reading(path, EXPECTED):
         archive = stack.enter_context(ZipFile(path))
-        position = _StoredArray(path, archive, "position", "integers", (None, 2))
-        stack.callback(position.close)
-        time = _StoredArray(path, archive, "timestamp", "integers", (None,))
-        stack.callback(time.close)
-        polarity = _StoredArray(path, archive, "polarity", "whole numbers or booleans", (None,))
-        stack.callback(polarity.close)
-    if not len(position) == len(time) == len(polarity):
-        raise RecordingError(
-            f"{path} holds {len(position):,} positions, {len(time):,} timestamps and {len(polarity):,} polarities, but "
-            "as many of each were expected."
-        )
+        for name, shape in forms.items():
+            kind = "whole numbers or booleans" if name == "polarity" else "integers"
+            arrays.append(_StoredArray(path, archive, name, kind, shape))
+            stack.callback(arrays[-1].close)
+    position, time, polarity = arrays
+    check_lengths(path, {"positions": len(position), "timestamps": len(time), "polarities": len(polarity)})
     if len(time) == 0:
         raise RecordingError(f"{path} holds no events; give a recording with some.")
     if position.by_column:
@@ -217,17 +208,8 @@ def _stream_events(path: Path, num_events: int) -> Iterator[Events]:
                 position, time, polarity = (
                     column.rows(min(EVENTS_AT_A_TIME, num_events - start)) for column in columns
                 )
-            yield Events(position[:, 0], position[:, 1], _nanoseconds(path, time), polarity)
-
-
-def _nanoseconds(path: Path, times: Int[np.ndarray, " times"]) -> Int64[np.ndarray, " times"]:
-    extremes = (int(times.min()), int(times.max())) if len(times) else (0,)
-    if any(abs(time) >= LATEST for time in extremes):
-        raise RecordingError(
-            f"{path} holds the time {max(extremes, key=abs)} ns, which is beyond 146 years; times were expected in "
-            "nanoseconds."
-        )
-    return times.astype(np.int64)
+            check_times(path, time)
+            yield Events(position[:, 0], position[:, 1], time.astype(np.int64), polarity)
 
 
 FORMAT = Format(

@@ -1,7 +1,7 @@
-"""Event files of Prophesee (EVT2, EVT2.1 and EVT3 in .raw, DAT) and iniVation (AEDAT4), without poses or calibration.
+"""Reads event files of Prophesee (EVT2, EVT2.1, EVT3, DAT) and iniVation (AEDAT4), which hold no poses or calibration.
 
-AEDAT4 is read through the package `aedat` and EVT3 through `evt3`; `pip install 'enerf-ns[event-files]'` installs both.
-EVT2, EVT2.1 and DAT are words of a fixed size, which NumPy takes apart.
+The package `aedat` reads AEDAT4, and `evt3` reads EVT3; `pip install 'enerf-ns[event-files]'` installs both. EVT2,
+EVT2.1 and DAT have words of a fixed size, which NumPy decodes.
 
 Prophesee's formats: docs.prophesee.ai, "Data Encoding Formats" and "File Formats"; AEDAT 4.0: docs.inivation.com.
 """
@@ -26,19 +26,18 @@ from enerf_ns.dataparsers.recording.files import reading
 from enerf_ns.dataparsers.recording.recording import Events
 
 BYTES_AT_A_TIME = 2**18
-"""Bytes that are read at once; a vector word of two bytes may hold twelve events."""
+"""Bytes that are read at once. A vector word of two bytes may hold twelve events."""
 
 LARGEST_HEADER = 2**16
-"""Bytes within which the text at the start of a .raw or .dat file ends."""
+"""Largest number of bytes of the text at the start of a .raw or .dat file."""
 
 AEDAT4_MAGIC = b"#!AER-DAT4.0\r\n"
 DAT_EVENT_TYPES = (0x00, 0x0C)
-"""Types of DAT files with events of contrast detection; they have one layout."""
+"""Types of DAT files with events of contrast detection, which have the same layout."""
 
 EVT2_TYPES = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 EVT3_TYPES = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
-"""Kinds of words that exist in EVT3, as `EVT2_TYPES` in EVT2; others show that a file is damaged or of another
-encoding."""
+"""Types of words in EVT3, as `EVT2_TYPES` in EVT2. Other types show that a file is damaged or has another encoding."""
 
 WORD_BYTES = {"EVT2": 4, "EVT2.1": 8, "EVT3": 2, "DAT": 8}
 
@@ -55,18 +54,18 @@ class EventFile:
     start: int
     """Time of the first event on the file's clock, ns."""
     stream: Callable[[], Iterator[Events]]
-    """Function of which every call gives all events anew, in pieces and as they are in the file: polarity {0, 1}, times
-    in ns from the first event. Raises RecordingError where the file is damaged."""
+    """Function that yields all events in pieces, as they are in the file: polarity 0 or 1, times in ns from the first
+    event. It raises RecordingError if the file is damaged."""
 
 
 def open_event_file(path: Path) -> EventFile:
-    """Reads what a file says about itself, and its first event.
+    """Reads the header and the first event of a file.
 
     Args:
-        path: The file; what it is, its contents tell.
+        path: The file; its content states the encoding.
 
     Raises:
-        RecordingError: The file is missing, empty, cut off, damaged, of no known encoding or without events, or the
+        RecordingError: The file is missing, empty, cut off, damaged, in no known encoding or without events, or the
             package that reads it is not installed.
     """
     with reading(path, "an event file"), open(path, "rb") as file:
@@ -95,11 +94,11 @@ def open_event_file(path: Path) -> EventFile:
 
 
 EventStream = Callable[[], Iterator[Events]]
-"""Function that gives the events in pieces, with times in microseconds on the file's clock."""
+"""Function that yields the events in pieces, with times in microseconds on the file's clock."""
 
 
 def _open_prophesee(path: Path, begin: bytes, num_bytes: int) -> tuple[str, tuple[int, int] | None, EventStream]:
-    """Encoding, size of the sensor and events of a .raw or .dat file."""
+    """Returns encoding, sensor size and events of a .raw or .dat file."""
     about, start = _prophesee_header(begin)
     name, *options = about.get("format", "").split(";")
     stated = {**about, **dict(option.split("=", 1) for option in options if "=" in option)}
@@ -144,7 +143,7 @@ def _open_prophesee(path: Path, begin: bytes, num_bytes: int) -> tuple[str, tupl
 
 
 def _prophesee_header(begin: bytes) -> tuple[dict[str, str], int]:
-    """What stands behind each keyword, in lower case, of the lines that begin with %; and where these lines end."""
+    """Returns the values of the lines that begin with % by keyword in lower case, and the end of these lines."""
     about: dict[str, str] = {}
     start = 0
     while begin.startswith(b"%", start) and b"\n" in begin[start:]:
@@ -170,7 +169,7 @@ def _sensor_size(path: Path, stated: dict[str, str]) -> tuple[int, int] | None:
 
 
 def _read_words(path: Path, start: int, stop: int, kind: np.dtype) -> Iterator[Shaped[np.ndarray, " words"]]:
-    """Bytes start to stop of a file as words; what was appended since is not read."""
+    """Yields bytes start to stop of a file as words; bytes that were appended later are not read."""
     try:
         with open(path, "rb") as file:
             file.seek(start)
@@ -185,7 +184,7 @@ def _read_words(path: Path, start: int, stop: int, kind: np.dtype) -> Iterator[S
 
 
 def _check_types(path: Path, types: Shaped[np.ndarray, " words"], known: tuple[int, ...], encoding: str) -> None:
-    """Whether all words are of a kind that the encoding has."""
+    """Raises RecordingError if a word has a type that the encoding lacks."""
     is_known = np.zeros(16, bool)
     is_known[list(known)] = True
     good = is_known[types]
@@ -197,13 +196,13 @@ def _check_types(path: Path, types: Shaped[np.ndarray, " words"], known: tuple[i
 
 
 class _Clock:
-    """Times of words from a counter that begins again after `period`, and that some words alone state."""
+    """Times of words from a counter that restarts after `period`."""
 
     def __init__(self, period: int):
         self.period, self.last, self.passed = period, 0, 0
 
     def unwrap(self, times: Int64[np.ndarray, " words"]) -> Int64[np.ndarray, " words"]:
-        """Times that go on where the counter of the given ones began again."""
+        """Returns times that continue where the counter restarted."""
         if not len(times):
             return times
         periods = self.passed + np.cumsum(np.diff(times, prepend=self.last) < -self.period // 2)
@@ -212,7 +211,7 @@ class _Clock:
 
 
 def _decode_dat(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """Events of DAT words: bits 0 to 31 time in microseconds, 32 to 45 x, 46 to 59 y, 60 to 63 polarity."""
+    """Yields events of DAT words: bits 0 to 31 time in microseconds, 32 to 45 x, 46 to 59 y, 60 to 63 polarity."""
     clock = _Clock(2**32)
     for words in pieces:
         address = (words >> np.uint64(32)).astype(np.int64)
@@ -221,7 +220,7 @@ def _decode_dat(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 
 
 def _decode_evt2(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """Events of EVT2 words: bits 28 to 31 type; of an event 22 to 27 lowest bits of time, 11 to 21 x, 0 to 10 y."""
+    """Yields events of EVT2 words: bits 28 to 31 type, 22 to 27 lowest bits of time, 11 to 21 x, 0 to 10 y."""
     clock, high = _Clock(2**28), -1
     for words in pieces:
         kinds = words >> 28
@@ -233,8 +232,7 @@ def _decode_evt2(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 
 
 def _decode_evt21(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    """Events of EVT2.1 words: the upper 32 bits as of EVT2; the lower ones tell which of the 32 pixels from x on have
-    fired."""
+    """Yields events of EVT2.1 words: the upper 32 bits as in EVT2, one lower bit for each of 32 pixels from x on."""
     clock, high = _Clock(2**28), -1
     for pair in pieces:
         words = (pair >> np.uint64(32)).astype(np.int64)
@@ -252,19 +250,19 @@ def _decode_evt21(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 def _high_times(
     clock: _Clock, states: np.ndarray, values: Int64[np.ndarray, " words"], before: int
 ) -> tuple[Int64[np.ndarray, " words"], int]:
-    """Upper bits of the time at each word, and after the last one; -1 before the first word that states them."""
+    """Returns the upper bits of the time at each word and after the last one; -1 before the first stated time."""
     stated = np.concatenate([[before], clock.unwrap(values[states])])
     return stated[np.cumsum(states)], int(stated[-1])
 
 
 def _evt21_order(path: Path, words: bytes) -> str:
-    """Which half of each word comes first, where the file does not say: the one with the type in words of time."""
+    """Returns the byte order of EVT2.1 words if the file does not state it, from the type in words of time."""
     halves = np.frombuffer(words[: len(words) // 8 * 8], "<u4").reshape(-1, 2)
     is_time = (halves >> 28 == 0x8) & (halves[:, ::-1] == 0)
     legacy, little = is_time.sum(axis=0)
     if legacy == little:
         raise RecordingError(
-            f"{path} does not state the endianness of its EVT2.1 words and they do not show it; record it anew with "
+            f"{path} does not state the endianness of its EVT2.1 words, and the words do not show it; record it with "
             "software that states it."
         )
     return "little" if little > legacy else "legacy"
@@ -279,7 +277,7 @@ def _decode_evt3(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
 
 
 def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
-    """Size of the sensor and events of an AEDAT4 file."""
+    """Returns sensor size and events of an AEDAT4 file."""
     aedat = _import("aedat", path)
     _check_aedat4(path)
     streams = _guarded(path, lambda: aedat.Decoder(path).id_to_stream())
@@ -301,10 +299,10 @@ def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
 
 
 def _check_aedat4(path: Path) -> None:
-    """Whether the parts of an AEDAT4 file lie where it says; its reader would end the process where they do not.
+    """Raises RecordingError if parts of an AEDAT4 file are not where it states. The package would end the process.
 
-    The header is a FlatBuffer (its tables refer to fields by offsets) with the text of an XML document; then each
-    packet follows after its stream's number and its size in bytes.
+    The header is a FlatBuffer, whose tables refer to fields by offsets, with an XML document. Then packets follow, each
+    after its stream's number and its size in bytes.
     """
     try:
         with open(path, "rb") as file:
@@ -337,7 +335,7 @@ def _check_aedat4(path: Path) -> None:
 
 
 def _guarded(path: Path, call: Callable):
-    """What a reader in Rust returns; its panics are no `Exception`, and are printed to the process's standard error."""
+    """Returns the result of a reader in Rust; its panics are no `Exception`, and go to standard error."""
     sys.stderr.flush()
     stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)

@@ -1,4 +1,4 @@
-"""Reader and writer of the layout for recordings of one's own, which a few lines of NumPy write, and `enerf convert`.
+"""Reader and writer of this project's layout, which a few lines of NumPy or `enerf convert` write.
 
     events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
     poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
@@ -8,8 +8,8 @@
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
                                      (both optional)
-    blurred_frames/*.png             frames blurred by motion, with such tables of their own (optional); where
-                                     reconstructed_by says what made them of the events, they are of the event camera
+    blurred_frames/*.png             frames blurred by motion, with the same tables (optional); if reconstructed_by
+                                     states that they were made from the events, their camera is the event camera
     depth/*.npy                      (height, width) depth in metres of each sharp frame, 0 where nothing is (optional)
 
 All times are nanoseconds on one clock, from any zero.
@@ -30,15 +30,17 @@ from jaxtyping import Float64, Int64
 from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_columns, check_times
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames
-from enerf_ns.dataparsers.formats.json_values import parse_nanoseconds, parse_numbers, shown
+from enerf_ns.dataparsers.formats.json_values import Value, open_json
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
     MOUNTING_KEY,
     EventFiles,
     GrowingArray,
+    Setup,
     Writer,
     camera_json,
     encode_json,
@@ -47,7 +49,7 @@ from enerf_ns.dataparsers.formats.writer import (
     is_second_camera,
     mounted_camera_json,
 )
-from enerf_ns.dataparsers.recording.camera import COEFFICIENTS, Camera, check_rotation
+from enerf_ns.dataparsers.recording.camera import COEFFICIENTS, Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import (
     check_is_folder,
@@ -55,7 +57,6 @@ from enerf_ns.dataparsers.recording.files import (
     load_array,
     load_image,
     of_file,
-    read_json,
     write_whole,
 )
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
@@ -68,41 +69,37 @@ OPTIONAL_KEYS = (
     *("reconstructed_by", "white_level"),
 )
 EXPOSURES_NAME = "exposures_ns.txt"
-STORED_TYPES = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.int8}
-
-LATEST = 2**62
-"""Time in ns, 146 years, that all times must stay below, so that differences of two never overflow."""
 
 MOUNTING_TOLERANCE = 1e-6
-"""Metres, and entries of a rotation, by which a camera may move against the one that it is fixed to."""
+"""Largest motion of the frame camera in the axes of the event camera: metres, and entries of the rotation."""
 
 
 def read(folder: Path) -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     Args:
-        folder: With the files that the module describes.
+        folder: The folder with the files that the module describes.
 
     Raises:
-        RecordingError: A file is missing or empty, or anything in it cannot be used.
+        RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     columns = _open_columns(folder / "events")
     path = folder / "recording.json"
-    about = read_json(path)
-    _check_keys(path, about, ("camera",), OPTIONAL_KEYS, "")
-    camera = parse_camera(path, "camera", about["camera"], folder / "camera_directions.npy")
+    about = open_json(path)
+    about.check_keys(("camera",), OPTIONAL_KEYS)
+    camera = parse_camera(about["camera"], folder / "camera_directions.npy")
     trajectory = Trajectory(*read_poses(folder / "poses.txt", "ns", notes))
     frame_camera, frame_trajectory = camera, trajectory
-    if "frame_camera" in about:
-        frame_camera, mounting = _parse_frame_camera(path, about["frame_camera"])
+    if (mounted := about.get("frame_camera")) is not None:
+        frame_camera, mounting = _parse_frame_camera(mounted)
         frame_trajectory = trajectory.of_mounted(mounting)
-    reconstructed_by = about.get("reconstructed_by")
+    reconstructed_by = about.found.get("reconstructed_by")
     blurred_rig = frame_camera, frame_trajectory
     if reconstructed_by is not None:
         blurred_rig = camera, trajectory
         notes.append(f"The blurred frames are reconstructed from events by {reconstructed_by}.")
-    white = _parse_white_level(path, about)
+    white = _parse_white_level(about)
     check_is_folder(folder / "depth", "a folder of depth maps")
     depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
     with of_file(path):
@@ -116,32 +113,29 @@ def read(folder: Path) -> EventRecording:
             frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, white, depth_files),
             blurred_frames=_read_frames(folder / "blurred_frames", *blurred_rig, white),
             reconstructed_by=reconstructed_by,
-            contrast_thresholds=_parse_two(
-                path, about, "contrast_thresholds", "two numbers above 0, of on and off events,"
-            ),
-            depth_range=_parse_two(path, about, "depth_range", "the nearest and the farthest depth in metres"),
-            refractory_period=parse_nanoseconds(path, about, "refractory_period_ns") or 0,
-            bayer_pattern=about.get("bayer_pattern"),
-            response=about.get("response"),
+            contrast_thresholds=about.pair("contrast_thresholds", "two numbers above 0, of on and off events, were"),
+            depth_range=about.pair("depth_range", "the nearest and the farthest depth in metres were"),
+            refractory_period=about.nanoseconds("refractory_period_ns") or 0,
+            bayer_pattern=about.found.get("bayer_pattern"),
+            response=about.found.get("response"),
             notes=tuple(notes),
-            locate_event=lambda index: f"{folder / 'events'}, event {index + 1},",
             num_events=len(columns["t"]),
         )
 
 
 def write(recording: EventRecording, folder: Path) -> int:
-    """Writes all events and poses of a recording, and its frames, calibration and depth; times stay as they are.
+    """Writes all events, poses, frames, calibration and depth of a recording, with the same times.
 
     Args:
-        recording: Of any format.
-        folder: Exists and is empty.
+        recording: A recording of any format.
+        folder: An empty folder.
 
     Returns:
         The number of events.
 
     Raises:
-        RecordingError: An event lies outside the sensor, goes back in time or has no such polarity, or the frames'
-            camera is not fixed to the event camera.
+        RecordingError: An event lies outside the sensor, goes back in time or has another polarity, or the camera of
+            the frames is not fixed to the event camera.
         OSError: The disk is full, or a frame cannot be copied.
     """
     kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
@@ -149,11 +143,14 @@ def write(recording: EventRecording, folder: Path) -> int:
     frame_cameras = [_frame_camera_json(recording, frames) for frames in of_frame_camera if frames is not None]
     if any(camera != frame_cameras[0] for camera in frame_cameras):
         raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
-    sensor = recording.contrast_thresholds, recording.refractory_period, recording.bayer_pattern, recording.response
     frame_camera = frame_cameras[0] if frame_cameras else None
     deep = [frames for frames in kinds.values() if frames is not None and is_deep(frames.filenames[0])]
-    frames_about = recording.reconstructed_by, deep[0].white_level if deep else None
-    about = _encode_about(recording.camera, frame_camera, *sensor, recording.depth_range, *frames_about)
+    white_level = deep[0].white_level if deep else None
+    about = _encode_about(
+        *(recording.camera, frame_camera, recording, recording.depth_range),
+        reconstructed_by=recording.reconstructed_by,
+        white_level=white_level,
+    )
     write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
@@ -175,20 +172,20 @@ def write_events(
     locate: Callable[[int], str],
     total: int | None = None,
 ) -> tuple[int, int]:
-    """Writes events piece by piece into x.npy, y.npy, t.npy and p.npy, and shows how many there are so far.
+    """Writes events piece by piece into x.npy, y.npy, t.npy and p.npy, and shows the progress.
 
     Args:
-        stream: In time order.
+        stream: Pieces of events in time order.
         folder: New folder for the files.
-        width, height: Of the sensor, pixels.
-        locate: File and line of event number i, for error messages.
-        total: How many there are, where that is known.
+        width, height: Size of the sensor, pixels.
+        locate: Function that names the file and line of event number i, for error messages.
+        total: Number of events, if it is known.
 
     Returns:
-        their number, and the time of the last one (ns).
+        The number of events, and the time of the last one (ns).
 
     Raises:
-        RecordingError: There are none, or one lies outside the sensor, goes back in time or has no such polarity.
+        RecordingError: There are no events, or one lies outside the sensor, goes back in time or has another polarity.
         OSError: The disk is full.
     """
     num_events, last = 0, -LATEST
@@ -211,11 +208,11 @@ def write_poses(
     positions: Float64[np.ndarray, "poses 3"],
     quaternions: Float64[np.ndarray, "poses 4"],
 ) -> None:
-    """Writes poses.txt so that reading it gives the same numbers.
+    """Writes poses.txt with all digits, so that the reader returns the same numbers.
 
     Args:
         path: The file.
-        times: ns.
+        times: Nanoseconds.
         positions: Metres.
         quaternions: xyzw.
 
@@ -225,36 +222,22 @@ def write_poses(
     write_whole(path, encode_poses("# t_ns px py pz qx qy qz qw", times, positions, quaternions))
 
 
-def parse_camera(path: Path, name: str, value: object, directions_file: Path | None = None) -> Camera:
-    """A camera from its JSON object.
+def parse_camera(value: Value, directions_file: Path | None = None) -> Camera:
+    """Returns the camera of a JSON object with width, height, model, fx, fy, cx, cy (pixels) and distortion.
 
     Args:
-        path: The JSON file.
-        name: Of the object in the file.
-        value: The object: width, height, model, fx, fy, cx, cy in pixels, and distortion where the model has it.
-        directions_file: Table of a camera of model lookup; None where there can be none.
+        value: The object; a model without distortion needs no such key.
+        directions_file: Table of a camera of the model lookup; None if this model is not possible.
 
     Raises:
-        RecordingError: Something is missing, unknown or out of range, or fits no lens.
+        RecordingError: A key is missing, unknown or out of range, or the camera fits no lens.
     """
-    if not isinstance(value, dict):
-        raise RecordingError(
-            f"{path} holds {name} = {shown(value)}, but an object with {_list(CAMERA_KEYS)} was expected."
-        )
-    _check_keys(path, value, CAMERA_KEYS, ("distortion",), f" in {name}")
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    width, height, fx, fy, cx, cy = parse_numbers(
-        path, f"{name} ({', '.join(names)})", [value[key] for key in names], (6,), "numbers of pixels"
-    ).tolist()
-    model = value["model"]
-    models = [known for known in COEFFICIENTS if known != "lookup" or directions_file is not None]
-    if model not in models:
-        raise RecordingError(f"{path} holds {name}.model = {shown(model)}, but one of {_list(models)} was expected.")
-    coefficients = value.get("distortion", [])
-    shape = (len(coefficients) if isinstance(coefficients, list) else 0,)
-    distortion = parse_numbers(path, f"{name}.distortion", coefficients, shape, "numbers").tolist()
-    with of_file(f"{path}, {name},"):
-        camera = Camera(width, height, fx, fy, cx, cy, tuple(distortion), "pinhole" if model == "lookup" else model)
+    value.check_keys(CAMERA_KEYS, ("distortion",))
+    width, height, *intrinsics = value.each("width", "height", "fx", "fy", "cx", "cy")
+    model = value["model"].choice(known for known in COEFFICIENTS if known != "lookup" or directions_file is not None)
+    coefficients = value.get("distortion")
+    distortion = [] if coefficients is None else [float(item.numbers(())) for item in coefficients.values()]
+    camera = value.camera((width, height), intrinsics, distortion, "pinhole" if model == "lookup" else model)
     if model != "lookup":
         return camera
     assert directions_file is not None
@@ -262,44 +245,26 @@ def parse_camera(path: Path, name: str, value: object, directions_file: Path | N
         return replace(camera, model="lookup", directions=load_array(directions_file).astype(np.float64))
 
 
-def _open_columns(folder: Path) -> dict[str, np.memmap]:
-    """The four files of events, of which only the headers are read."""
-    columns = {}
-    for name, stored in STORED_TYPES.items():
-        path = folder / f"{name}.npy"
-        column = load_array(path, mmap_mode="r")
-        kinds = "iub" if name == "p" else "iu"
-        if column.ndim != 1 or column.dtype.kind not in kinds:
-            raise RecordingError(
-                f"{path} holds an array of type {column.dtype} and shape {column.shape}, but one-dimensional whole "
-                f"numbers were expected; save them with .astype(np.{stored.__name__})."
-            )
-        columns[name] = column
-    if len({len(column) for column in columns.values()}) > 1:
-        lengths = ", ".join(f"{len(column):,} in {name}.npy" for name, column in columns.items())
-        raise RecordingError(f"{folder} holds columns of different lengths ({lengths}); give each event all four.")
-    if not len(columns["t"]):
-        raise RecordingError(f"{folder} holds no events; give a recording with some.")
+def _open_columns(folder: Path) -> dict[str, Any]:
+    """Opens the four files of events; only their headers are read."""
+    columns = {name: load_array(folder / f"{name}.npy", mmap_mode="r") for name in STORED_TYPES}
+    check_columns(folder, {f"{name}.npy": column for name, column in columns.items()}, "ns")
     return columns
 
 
-def _stream_events(folder: Path, columns: dict[str, np.memmap]) -> Iterator[Events]:
-    """The events that the files held when their headers were read."""
+def _stream_events(folder: Path, columns: dict[str, Any]) -> Iterator[Events]:
+    """Yields the events that the files held when their headers were read."""
     length = len(columns["t"])
     for start in range(0, length, EVENTS_AT_A_TIME):
         count = min(EVENTS_AT_A_TIME, length - start)
         pieces = {name: _read_piece(folder / f"{name}.npy", column, start, count) for name, column in columns.items()}
         t = pieces.pop("t")
-        extremes = int(t.min()), int(t.max())
-        if any(abs(time) >= LATEST for time in extremes):
-            raise RecordingError(
-                f"{folder / 't.npy'} holds the time {max(extremes, key=abs)} ns, which is beyond 146 years."
-            )
+        check_times(folder / "t.npy", t)
         yield Events(t=t.astype(np.int64, copy=False), **pieces)
 
 
 def _read_piece(path: Path, column: np.memmap, start: int, count: int) -> np.ndarray:
-    """Some rows of a column; by reading and not by mapping, so that a file that shrinks is noticed."""
+    """Returns some rows of a column. Reading notices a file that shrinks, which a memory map does not."""
     try:
         piece = np.fromfile(path, column.dtype, count, offset=column.offset + start * column.dtype.itemsize)
     except OSError as error:
@@ -330,69 +295,53 @@ def _check_events(events: Events, last: int, width: int, height: int, locate: Ca
 
 
 def read_cameras(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
-    """The camera of the events, that of the frames, and the pose of the latter in the axes of the former.
+    """Returns the event camera, the frame camera, and the pose of the frame camera in the axes of the event camera.
 
     Args:
-        path: JSON file with camera and, if another one takes the frames, frame_camera, as in recording.json.
+        path: JSON file with camera and, if another camera takes the frames, frame_camera, as in recording.json.
 
     Raises:
         RecordingError: The file is missing or holds no such cameras.
     """
-    about = read_json(path)
-    if MOUNTING_KEY in about:
-        raise RecordingError(f"{path} holds {MOUNTING_KEY} beside frame_camera, but it belongs inside of it.")
-    camera = parse_camera(path, "camera", about.get("camera"))
-    if "frame_camera" not in about:
-        return camera, camera, np.eye(4)
-    return camera, *_parse_frame_camera(path, about["frame_camera"])
+    about = open_json(path)
+    if about.get(MOUNTING_KEY) is not None:
+        raise RecordingError(f"{path} holds {MOUNTING_KEY} beside frame_camera; move it into frame_camera.")
+    camera = parse_camera(about["camera"])
+    mounted = about.get("frame_camera")
+    return (camera, camera, np.eye(4)) if mounted is None else (camera, *_parse_frame_camera(mounted))
 
 
-def _parse_frame_camera(path: Path, value: object) -> tuple[Camera, Float64[np.ndarray, "4 4"]]:
-    """The camera of the frames, and its pose in the axes of the event camera."""
-    if not isinstance(value, dict) or MOUNTING_KEY not in value:
-        return parse_camera(path, "frame_camera", value), np.eye(4)
-    name = f"frame_camera.{MOUNTING_KEY}"
-    mounting = parse_numbers(path, name, value[MOUNTING_KEY], (4, 4), "a matrix of 4 x 4 numbers")
-    try:
-        check_rotation(mounting[:3, :3])
-    except ValueError as error:
-        raise RecordingError(f"{path} holds a {name} whose upper left 3 x 3 part {error}.") from error
-    if (mounting[3] != [0, 0, 0, 1]).any():
-        raise RecordingError(
-            f"{path} holds a {name} whose last row is {mounting[3].tolist()}, but 0 0 0 1 was expected."
-        )
-    camera = {key: item for key, item in value.items() if key != MOUNTING_KEY}
-    return parse_camera(path, "frame_camera", camera), mounting
+def _parse_frame_camera(value: Value) -> tuple[Camera, Float64[np.ndarray, "4 4"]]:
+    """Returns the camera of the frames, and its pose in the axes of the event camera."""
+    if value.get(MOUNTING_KEY) is None:
+        return parse_camera(value), np.eye(4)
+    camera = {key: item for key, item in value.found.items() if key != MOUNTING_KEY}
+    return parse_camera(replace(value, found=camera)), value[MOUNTING_KEY].pose()
 
 
 def _encode_about(
     camera: Camera,
     frame_camera: dict[str, Any] | None,
-    contrast_thresholds: tuple[float, float] | None,
-    refractory_period: int,
-    bayer_pattern: str | None,
-    response: str | None,
+    sensor: EventRecording | Setup,
     depth_range: tuple[float, float] | None,
-    reconstructed_by: str | None = None,
-    white_level: float | None = None,
+    **about_frames: Any,
 ) -> bytes:
-    """recording.json, in which what is not known is left out."""
+    """Returns the content of recording.json, without the keys whose values are not known."""
     about = {
         "camera": camera_json(camera),
         "frame_camera": frame_camera,
-        "contrast_thresholds": contrast_thresholds,
-        "refractory_period_ns": refractory_period or None,
-        "bayer_pattern": bayer_pattern,
-        "response": response,
+        "contrast_thresholds": sensor.contrast_thresholds,
+        "refractory_period_ns": sensor.refractory_period or None,
+        "bayer_pattern": sensor.bayer_pattern,
+        "response": sensor.response,
         "depth_range": depth_range,
-        "reconstructed_by": reconstructed_by,
-        "white_level": white_level,
+        **about_frames,
     }
     return encode_json({key: value for key, value in about.items() if value is not None})
 
 
 def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, Any] | None:
-    """The frames' camera as recording.json states it; None where it is the event camera."""
+    """Returns the frame camera as recording.json states it, or None if it is the event camera."""
     body, mounted = recording.trajectory, frames.trajectory
     if mounted is body and frames.camera == recording.camera:
         return None
@@ -402,13 +351,13 @@ def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, A
     mountings = inverses @ (cameras - np.pad(bodies[:, :, 3:], ((0, 0), (0, 0), (3, 0))))
     if not len(mountings) or np.abs(mountings - mountings[0]).max() > MOUNTING_TOLERANCE:
         raise RecordingError(
-            f"{recording.path} holds frames of a camera that moves against the event camera, but this layout has one "
-            "pose for both and the extrinsics between them."
+            f"{recording.path} holds frames of a camera that moves against the event camera, but this layout holds one "
+            "trajectory and constant extrinsics."
         )
     if frames.camera.model == "lookup":
         raise RecordingError(
-            f"{recording.path} holds frames of a camera with a table of directions, but this layout has such a table "
-            "for the event camera alone."
+            f"{recording.path} holds frames of a camera with a table of directions, but this layout holds such a table "
+            "only for the event camera."
         )
     return mounted_camera_json(frames.camera, np.vstack([mountings[0], [0.0, 0.0, 0.0, 1.0]]))
 
@@ -423,12 +372,12 @@ def _read_frames(
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
-    """Copies frames and their depth; names are their numbers, so that they sort as they were."""
+    """Copies frames and their depth; the numbers of the frames become names that sort in the same order."""
     folder.mkdir()
     digits = max(5, len(str(frames.numbers[-1])))
     names = [f"{number:0{digits}d}" for number in frames.numbers.tolist()]
     for name, source in zip(names, frames.filenames, strict=True):
-        load_image(source)  # which says so where it is damaged
+        load_image(source)  # raises RecordingError if it is damaged
         shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
     (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
     if frames.exposures is not None:
@@ -439,45 +388,20 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
             shutil.copyfile(source, depth_folder / f"{name}.npy")
 
 
-def _check_keys(path: Path, value: dict, required: tuple[str, ...], optional: tuple[str, ...], where: str) -> None:
-    missing = [key for key in required if key not in value]
-    if missing:
-        raise RecordingError(f"{path} lacks {_list(missing)}{where}; add it, as the layout event_recording asks for.")
-    unknown = [key for key in value if key not in required + optional]
-    if unknown:
-        raise RecordingError(
-            f"{path} holds the unknown key {unknown[0]!r}{where}; known are {_list(required + optional)}."
-        )
-
-
-def _parse_two(path: Path, about: dict, name: str, expected: str) -> tuple[float, float] | None:
-    if name not in about:
+def _parse_white_level(about: Value) -> float | None:
+    value = about.get("white_level")
+    if value is None:
         return None
-    first, second = parse_numbers(path, name, about[name], (2,), expected).tolist()
-    return first, second
-
-
-def _parse_white_level(path: Path, about: dict) -> float | None:
-    if "white_level" not in about:
-        return None
-    white = about["white_level"]
-    if type(white) not in (int, float) or not 0 < white < np.inf:
-        raise RecordingError(
-            f"{path} holds white_level = {shown(white)}, but a number above 0, that of full brightness in files of "
-            "more than 8 bits, was expected."
-        )
-    return float(white)
-
-
-def _list(names: tuple[str, ...] | list[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    expected = "a number above 0, the value of full brightness in files of more than 8 bits, was"
+    if (white := float(value.numbers((), expected))) <= 0:
+        raise value.wrong(expected)
+    return white
 
 
 class EventRecordingWriter(Writer):
     """Writer of this project's own layout."""
 
     layout = "event_recording"
-    is_of_reference = False
     frame_folders = ("frames", "blurred_frames")
     stamps_name = "stamps_ns.txt"
 
@@ -501,8 +425,7 @@ class EventRecordingWriter(Writer):
         setup = self.setup
         rig = setup.event_camera, setup.frame_camera, setup.event_from_frame
         frame_camera = mounted_camera_json(*rig[1:]) if is_second_camera(*rig) else None
-        sensor = setup.contrast_thresholds, setup.refractory_period, setup.bayer_pattern, setup.response
-        self._replace("recording.json", _encode_about(rig[0], frame_camera, *sensor, self.depth_range))
+        self._replace("recording.json", _encode_about(rig[0], frame_camera, setup, self.depth_range))
 
     def _write_poses(self, trajectory: Trajectory) -> None:
         write_poses(self.folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
@@ -515,7 +438,7 @@ class EventRecordingWriter(Writer):
 
 
 class _ColumnFiles:
-    """The files x.npy, y.npy, t.npy and p.npy of a recording that is written."""
+    """Writer of the files x.npy, y.npy, t.npy and p.npy."""
 
     def __init__(self, folder: Path):
         self._files = {name: GrowingArray(folder / f"{name}.npy", dtype) for name, dtype in STORED_TYPES.items()}

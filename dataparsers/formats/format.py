@@ -1,4 +1,4 @@
-"""What the registry knows of a layout of recordings."""
+"""The description of a layout of recordings, which the registry holds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 
 @dataclass(frozen=True)
 class FormatOptions:
-    """What may be chosen of a recording of a format: none, unless a subclass has fields.
+    """The options of a format; this base class has none.
 
-    A subclass is a frozen dataclass whose fields have defaults, and below each a string that becomes the help of its
-    flag; `Format.read` takes them by name.
+    A subclass is a frozen dataclass. Each field has a default, and below it a string that becomes the help of its flag.
+    `Format.read` takes the options by name.
     """
 
 
@@ -29,10 +29,10 @@ class Format:
     description: str
     """One sentence about the format, for the help of its sub-command."""
     files: tuple[str, ...]
-    """Patterns (glob) of files that tell a folder of this format from those of others."""
+    """Patterns (glob) of files that distinguish this format from others."""
     read: Callable[..., EventRecording]
-    """Reads all but the events from a folder (Path), with the options by name; raises RecordingError."""
+    """Function that reads a folder (Path) without its events, with the options by name; raises RecordingError."""
     options: type[FormatOptions] = FormatOptions
     """Class of the options that `read` takes."""
     writer: type[Writer] | None = None
-    """Class that writes such a folder; None where it can only be read."""
+    """Class that writes such a folder; None if the format can only be read."""

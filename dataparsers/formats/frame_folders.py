@@ -1,4 +1,4 @@
-"""Frames that lie in a folder in the order of their names, with a table of stamps."""
+"""Reads the frames of a folder, in the order of their names, with the table of their stamps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,50 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows, read_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_size, check_is_folder, load_array, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import LONGEST_EXPOSURE, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
+
+
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Returns the .png files of a folder in order, or else its .jpg files; none if the folder is missing.
+
+    Raises:
+        RecordingError: The place is a file.
+    """
+    check_is_folder(folder, "a folder of frames")
+    return tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
+
+
+def read_stamps(files: Sequence[Path], stamps_file: Path, unit: str, folder: Path) -> Int64[np.ndarray, " frames"]:
+    """Returns the time (ns) of each image from a file with one time in each line.
+
+    Args:
+        files: The images.
+        stamps_file: The table of times.
+        unit: The unit of the times, "s", "us" or "ns".
+        folder: The folder of the images, for error messages.
+
+    Raises:
+        RecordingError: The table cannot be read, or it does not have one time for each image.
+    """
+    times = read_times(stamps_file, unit)
+    check_one_each(folder, len(files), stamps_file, len(times), "stamps")
+    return times
+
+
+def check_one_each(folder: Path, num_images: int, table: Path, num_rows: int, what: str) -> None:
+    """Raises RecordingError unless a table has one row for each image of a folder."""
+    if num_images != num_rows:
+        name = f"its {table.name}" if table.parent == folder else table
+        raise RecordingError(
+            f"{folder} holds {num_images:,} images, but {name} holds {num_rows:,} {what}; give one for each image."
+        )
 
 
 def read_frames(
@@ -23,38 +60,32 @@ def read_frames(
     depth_files: Sequence[Path] = (),
     exposures_file: Path | None = None,
 ) -> Frames | None:
-    """Frames of one camera; of images and depth maps, only the headers are read.
+    """Returns the frames of one camera; of images and depth maps, only the headers are read.
 
     Args:
-        files: Images in order of time.
-        stamps_file: Beside them, one time (ns) a line.
-        camera: Of all of them.
-        trajectory: Of this camera.
-        depth_files: .npy, one for each frame, or none.
-        exposures_file: One exposure (ns) a line, in the order of the stamps; may be missing.
+        files: The images in order of time.
+        stamps_file: The table beside them, with one time (ns) in each line.
+        camera: The camera of all frames.
+        trajectory: The trajectory of this camera.
+        depth_files: One .npy file for each frame, or none.
+        exposures_file: The table with one exposure (ns) in each line, in the order of the stamps; may be missing.
 
     Returns:
-        None where there are neither images nor stamps.
+        None if there are neither images nor stamps.
 
     Raises:
-        RecordingError: There are not as many stamps, exposures or depth maps as images, or one of them cannot be read,
-            is of another size than the camera's, or is no exposure that a frame can have.
+        RecordingError: The numbers of stamps, exposures, depth maps and images differ, a file cannot be read, a size is
+            not the camera's, or an exposure is out of range.
     """
     check_is_folder(stamps_file.parent, "a folder of frames")
     if not files and not stamps_file.exists():
         return None
-    times = read_times(stamps_file, "ns")
-    if len(times) != len(files):
-        raise RecordingError(
-            f"{stamps_file.parent} holds {len(files)} images, but its {stamps_file.name} holds {len(times)} stamps; "
-            "give one each."
-        )
-    for file in files:
-        check_image_size(file, camera.width, camera.height)
+    times = read_stamps(files, stamps_file, "ns", stamps_file.parent)
+    check_image_sizes(files, camera.width, camera.height)
     if depth_files and len(depth_files) != len(files):
         raise RecordingError(
             f"{depth_files[0].parent} holds {len(depth_files)} depth maps, but {stamps_file.parent} holds "
-            f"{len(files)} images; give one each."
+            f"{len(files)} images; give one for each image."
         )
     for file in depth_files:
         shape = load_array(file, mmap_mode="r").shape

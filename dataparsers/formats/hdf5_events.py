@@ -1,26 +1,28 @@
-"""Events in HDF5 files of the layout of DSEC, TUM-VIE and EDS: whole microseconds, and one dataset a column.
+"""Reads and writes events in HDF5 files as DSEC, TUM-VIE and EDS have them: one dataset for each column.
 
     x, y        integers, pixels
     t           integers, µs
     p           integers or booleans, polarity
-    t_offset    one integer, µs, to be added to every time (optional, at the root)
+    t_offset    one integer, µs, which is added to every time (optional, at the root)
 
-The columns lie in the group events/ or at the root. Rectify maps, which come beside such files, are read here as well.
+The columns lie in the group events/ or at the root. This module also reads the rectify maps that come with such files.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32
 
+from enerf_ns.dataparsers.formats.columns import check_columns, check_times
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import reading, write_all
+from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
 
 if TYPE_CHECKING:
@@ -28,34 +30,31 @@ if TYPE_CHECKING:
 
 COLUMNS = ("x", "y", "t", "p")
 
-LATEST = 2**62 // 1000
-"""Time in µs; what lies beyond (146 years) does not fit into 64 bits of nanoseconds, or is no µs."""
-
 BLOSC_FILTERS, BLOSC_PARAMETERS = (32001, 32026), 4
-"""Filters Blosc and Blosc2, and how many parameters they have at least; they end the process where they find fewer in a
-damaged file."""
+"""HDF5 numbers of Blosc and Blosc2, and their least number of parameters. These filters end the process if a damaged
+file states fewer."""
 
 METADATA_BYTES = 2**17
-"""Bytes by which a file that is written may grow beside its events at a time."""
+"""Bytes that one addition to a file may need beside its events."""
 
 SMALLEST_CACHE = 2**20
-"""Least bytes of cache for chunks that were decompressed and are not yet used up."""
+"""Least bytes of cache for decompressed chunks that are not used up."""
 
 
 class Hdf5Events:
-    """The events of a file, looked at once, and read in pieces later.
+    """The events of a file. The constructor checks them; `stream` reads them in pieces.
 
     Args:
         path: The file.
 
     Raises:
-        RecordingError: The file is missing, truncated or no HDF5, lacks a column, is empty, has columns of another type
+        RecordingError: The file is missing, truncated, not HDF5 or empty, lacks a column, has columns of another type
             or of different lengths, or is compressed by a filter that is not available.
     """
 
     path: Path
     num_events: int
-    """Number of events when the file was looked at; what is appended later does not count."""
+    """Number of events when the file was opened first; events that are appended later do not count."""
     first_time: int
     """Time of the first event, ns on the clock of the file."""
     last_time: int
@@ -66,7 +65,9 @@ class Hdf5Events:
         self._cache = SMALLEST_CACHE
         with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
-            self._check(columns)
+            for column in columns.values():
+                _check_filters(self.path, column)
+            check_columns(self.path, columns, "µs")
             self._offset = self._read_offset(file)
             self._cache = max(SMALLEST_CACHE, *(_chunk_bytes(column) for column in columns.values()))
             self.num_events = len(columns["t"])
@@ -74,13 +75,13 @@ class Hdf5Events:
             self.last_time = int(self._times(columns["t"], self.num_events - 1, self.num_events, 0)[0])
 
     def stream(self, zero: int) -> Iterator[Events]:
-        """The events that were there when the file was looked at, in file order, `EVENTS_AT_A_TIME` at once.
+        """Yields the `num_events` events in file order, `EVENTS_AT_A_TIME` at once.
 
         Args:
             zero: Time (ns, on the clock of the file) that becomes 0.
 
         Raises:
-            RecordingError: The file cannot be read any more, or has fewer events than before.
+            RecordingError: The file cannot be read any more, or has fewer events than at first.
         """
         with reading(self.path, "an HDF5 file with events"):
             file = self._open()
@@ -95,7 +96,7 @@ class Hdf5Events:
                 if not len(x) == len(y) == len(t) == len(p) == stop - start:
                     raise RecordingError(
                         f"{self.path} held {self.num_events:,} events and holds fewer now; wait until it is written, "
-                        "then read it again."
+                        "and read it again."
                     )
                 yield Events(x, y, t, p)
 
@@ -124,24 +125,6 @@ class Hdf5Events:
             )
         return columns  # type: ignore[return-value]
 
-    def _check(self, columns: dict[str, h5py.Dataset]) -> None:
-        for name, column in columns.items():
-            if column.dtype.kind not in ("iub" if name == "p" else "iu"):
-                expected = "whole microseconds (integers)" if name == "t" else "integers"
-                raise RecordingError(f"{self.path} holds {name} as {column.dtype}, but {expected} were expected.")
-            if column.ndim != 1:
-                raise RecordingError(
-                    f"{self.path} holds {name} as an array of shape {column.shape}, but one number an event was "
-                    "expected."
-                )
-            _check_filters(self.path, column)
-        lengths = {name: len(column) for name, column in columns.items()}
-        if len(set(lengths.values())) > 1:
-            found = ", ".join(f"{length:,} {name}" for name, length in lengths.items())
-            raise RecordingError(f"{self.path} holds {found}, but as many of each were expected; copy it again.")
-        if lengths["t"] == 0:
-            raise RecordingError(f"{self.path} holds no events; give a recording with some.")
-
     def _read_offset(self, file: h5py.File) -> int:
         member = _member(self.path, file, "t_offset")
         if member is None:
@@ -155,33 +138,31 @@ class Hdf5Events:
         return int(offset.reshape(()))
 
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
-        """Times of some events, nanoseconds from `zero`."""
+        """Returns the times of some events, nanoseconds from `zero`."""
         times = column[start:stop]
-        extremes = (int(times.min()) + self._offset, int(times.max()) + self._offset) if len(times) else ()
-        if any(abs(time) >= LATEST for time in extremes):
-            raise RecordingError(
-                f"{self.path} holds the time {max(extremes, key=abs)} µs, which is beyond 146 years; times were "
-                "expected in microseconds."
-            )
+        check_times(self.path, times, "µs", self._offset)
         times = times.astype(np.int64)
         times *= 1000
         times += self._offset * 1000 - zero
         return times
 
 
-def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray, "height width 2"]:
-    """Where each pixel of a camera lies in its undistorted image: x and y in pixels.
+def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
+    """Returns a camera of the model lookup from its rectify map.
+
+    The map holds, for each pixel of the sensor, its place (x, y in pixels) in the undistorted image.
 
     Args:
-        path: HDF5 file with the dataset rectify_map.
-        width, height: Of the sensor, pixels.
+        path: HDF5 file with the dataset rectify_map, floats [height, width, 2].
+        undistorted: The pinhole camera of the undistorted image.
 
     Raises:
-        RecordingError: The file is missing, truncated or no HDF5, or holds no such map of this size.
+        RecordingError: The file is missing, truncated or not HDF5, or holds no such map of the size of the camera.
     """
     import h5py
     import hdf5plugin  # noqa: F401  makes the filters known
 
+    height, width = undistorted.height, undistorted.width
     with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
         dataset = _member(path, file, "rectify_map")
         if not isinstance(dataset, h5py.Dataset):
@@ -197,18 +178,21 @@ def read_rectify_map(path: Path, width: int, height: int) -> Float32[np.ndarray,
         raise RecordingError(f"{path} holds a rectify_map with numbers that are not finite; make it again.")
     if not (np.diff(rectify_map[..., 0], axis=1).min() > 0 and np.diff(rectify_map[..., 1], axis=0).min() > 0):
         raise RecordingError(
-            f"{path} holds a rectify_map whose x does not increase along rows or whose y does not down columns, as "
-            "those of a camera do; make it again."
+            f"{path} holds a rectify_map whose x does not increase along rows or whose y does not increase along "
+            "columns, as in the map of a camera; make it again."
         )
-    return rectify_map
+    matrix = undistorted.matrix
+    directions = (rectify_map.astype(np.float64) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    with of_file(path):
+        return replace(undistorted, model="lookup", directions=directions)
 
 
 def _member(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
-    """What has a name in a group; None where nothing has.
+    """Returns the member of a group with this name, or None.
 
     Raises:
-        RecordingError: It is kept elsewhere, by a link, as external storage or as a virtual dataset: what lies in
-            another file of the disk is not for the sender of this one to name.
+        RecordingError: The member is a link, external storage or a virtual dataset. A hostile file could name another
+            file of the user's disk in this way.
     """
     import h5py
 
@@ -250,19 +234,19 @@ def _chunk_bytes(dataset: h5py.Dataset) -> int:
 class Hdf5EventsFile:
     """An HDF5 file of events that grows: x, y, t (whole microseconds) and p (0 or 1).
 
-    If they are in a group, there is also ms_to_idx: each millisecond's first event.
+    With a group, the file also holds ms_to_idx: the index of the first event of each millisecond.
 
-    Only whole chunks are added until the file is closed, since one that is rewritten as it grows may end up in place
-    of another that the file on the disk still refers to. The room that an addition needs is taken from the disk before
-    it is made, since a file whose addition fails halfway cannot be read any more. The oldest version of the file format
-    is used, in which a file is not marked as open.
+    Until the file is closed, only whole chunks are added. A chunk that is rewritten as it grows may replace another one
+    that the file on the disk still refers to. Before an addition, its space is reserved on the disk, since a file whose
+    addition fails halfway cannot be read any more. The oldest version of the file format is used, in which an open file
+    is not marked as open.
 
     Args:
-        path: The file, which is made anew.
+        path: The new file.
         group: "events/", or "" for the root.
-        filters: Of h5py's `create_dataset`.
-        to_us: From times (ns) to the microseconds that the file shall hold.
-        chunk: Events that are compressed, and written, together.
+        filters: Arguments for h5py's `create_dataset`.
+        to_us: Function from times (ns) to the microseconds in the file.
+        chunk: Number of events that are compressed and written together.
     """
 
     def __init__(self, path: Path, group: str, filters: dict, to_us: Callable[[np.ndarray], np.ndarray], chunk: int):
@@ -288,7 +272,7 @@ class Hdf5EventsFile:
 
     def close(self) -> None:
         try:
-            for column in self._columns.values():  # of which some may have grown before an interruption
+            for column in self._columns.values():  # an interruption may have left some longer than others
                 column.resize((self._num_events,))
             if self._milliseconds is not None:
                 self._milliseconds.resize((self._next_millisecond,))
@@ -299,7 +283,7 @@ class Hdf5EventsFile:
             os.truncate(self._path, length)
 
     def _add(self, count: int) -> None:
-        """Adds the first events of those held back."""
+        """Adds the first `count` events that are held back."""
         if not count:
             return
         times, indices = self._rest["t"][:count], np.zeros(0, np.int64)
@@ -319,7 +303,7 @@ class Hdf5EventsFile:
         self._rest = {name: column[count:] for name, column in self._rest.items()}
 
     def _reserve(self, num_bytes: int) -> None:
-        """Makes the file so much longer than the library knows; what lies behind its end it uses as it needs it."""
+        """Lengthens the file beyond the end that the HDF5 library knows; the library fills this space later."""
         end = self._file.id.get_filesize() + num_bytes + METADATA_BYTES
         with open(self._path, "r+b", buffering=0) as file:
             length = file.seek(0, os.SEEK_END)

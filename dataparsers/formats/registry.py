@@ -1,8 +1,8 @@
-"""Which formats there are, and which one a folder has.
+"""The registry of all formats, which finds the format of a folder and reads it.
 
-A format is a module that defines a `Format`; adding one means writing that module and naming it in the line below
-`_FORMATS`, or, outside of this package, calling `register`. For a sub-command of `ns-train`, it is then to be named as
-an entry point (nerfstudio.dataparser_configs) too.
+A format is a module that defines a `Format`. To add one, write the module and name it in the loop over modules below,
+or call `register` from another package. A sub-command of `ns-train` also needs an entry point in
+nerfstudio.dataparser_configs.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 _FORMATS: dict[str, Format] = {}
 
 FILES_OF_A_RECORDING = 2
-"""Files of a format by which a folder is known for a recording that nothing is written to."""
+"""Least number of files of a format that mark a folder as a recording, which is never written to."""
 
 
 def register(format: Format) -> None:
-    """Makes a format known: it is found out from folders, and can be named.
+    """Adds a format to the registry.
 
     Args:
-        format: Its name and its command are those of no other, and the name is not auto.
+        format: The format; its name and command must be new, and its name must not be auto.
 
     Raises:
-        ValueError: There is a format of this name or command already, or the name means that it be found out.
+        ValueError: The name or command is taken, or the name is auto.
     """
     taken = {name for known in formats() for name in (known.name, known.command)}
     if format.name == "auto":
-        raise ValueError("A format cannot be named auto, which means that it is found out; give it another name.")
+        raise ValueError("A format cannot be named auto, which stands for automatic detection; give it another name.")
     if format.name in taken or format.command in taken:
         raise ValueError(f"There is a format {format.name} or {format.command} already; give this one other names.")
     _FORMATS[format.name] = format
 
 
 def formats() -> tuple[Format, ...]:
-    """All formats, in the order in which they were registered."""
+    """Returns all formats in the order of their registration."""
     return tuple(_FORMATS.values())
 
 
 def format_named(name: str) -> Format:
-    """The format of this name.
+    """Returns the format of this name.
 
     Raises:
         FlagError: There is none.
@@ -67,30 +67,30 @@ def read_recording(
     smooth_poses: bool = False,
     **options: object,
 ) -> EventRecording:
-    """Reads a recording; its events are read when first asked for. A folder is read once per process.
+    """Reads a recording without its events, which are read when they are needed. A process reads each folder once.
 
     Args:
         path: Folder of the recording; never written to.
-        format: Name of a registered format, or "auto" to find out.
-        time_range: As of `EventRecording.selected`.
-        keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses: As of `EventRecording.selected`.
-        options: Of the format, by name; those left out have its defaults.
+        format: Name of a registered format, or "auto" to detect it.
+        time_range: Argument of `EventRecording.selected`.
+        keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses: Arguments of `EventRecording.selected`.
+        options: Options of the format, by name.
 
     Raises:
-        RecordingError: The folder is of no known format, or anything in it cannot be used.
-        FlagError: There is no such format, it lacks an option, or the range of time cannot be used.
+        RecordingError: The folder has no known format, or its content cannot be used.
+        FlagError: There is no such format, it lacks an option, or the time range cannot be used.
     """
     found = _read_folder(absolute(path), format, **options)
     return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses)
 
 
 def layouts() -> tuple[str, ...]:
-    """Names of the formats that can be written."""
+    """Returns the names of the formats that can be written."""
     return tuple(format.name for format in formats() if format.writer is not None)
 
 
 def writer_of(layout: str) -> type[Writer]:
-    """The class that writes a layout.
+    """Returns the class that writes a layout.
 
     Raises:
         FlagError: There is none.
@@ -102,15 +102,15 @@ def writer_of(layout: str) -> type[Writer]:
 
 
 def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
-    """Begins a recording, to be used in a `with` statement at whose end the recording is finished.
+    """Returns the writer of a new recording, for a `with` statement, whose end finishes the recording.
 
     Args:
         layout: One of `layouts`.
-        folder: Exists and is empty.
-        setup: What is recorded.
+        folder: An empty folder.
+        setup: The properties of the recording.
 
     Raises:
-        FlagError: The layout cannot hold these cameras or that few frames, or the extrinsics are no rigid motion.
+        FlagError: The layout cannot hold these cameras or so few frames, or the extrinsics are not a rigid motion.
         OutputError: The disk is full.
     """
     return writer_of(layout)(folder, setup)
@@ -142,16 +142,16 @@ def _check_options(path: Path, found: Format, options: dict[str, object]) -> Non
 
 
 def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> None:
-    """Refuses a place for results within a recording, which nothing is ever written to, or that is itself read.
+    """Checks that results do not go into a recording or replace an input.
 
     Args:
-        flag: That gives the place.
-        output: A file or a folder, there or not.
-        read: Files and folders that the results come from; any other folder with `FILES_OF_A_RECORDING` of a format's
-            files is taken for a recording too.
+        flag: The flag that states the place of the results.
+        output: The file or folder of the results, which may be missing.
+        read: Files and folders of the input. Any other folder with `FILES_OF_A_RECORDING` files of a format counts as a
+            recording too.
 
     Raises:
-        OutputError: The place lies in one of them, or is one.
+        OutputError: The place lies in an input or a recording, or is one.
     """
     output = absolute(output)
     sources = {absolute(path) for path in read if path is not None}
@@ -162,12 +162,12 @@ def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> Non
 
 
 def _files_found(path: Path) -> dict[Format, int]:
-    """How many of the files of each format lie in a folder."""
+    """Returns the number of files of each format in a folder."""
     return {format: sum(any(path.glob(pattern)) for pattern in format.files) for format in formats()}
 
 
 def _find_format(path: Path) -> Format:
-    """Of the formats, the one most of whose files lie in a folder."""
+    """Returns the format with the most files in a folder."""
     found = _files_found(path)
     best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) == 1:

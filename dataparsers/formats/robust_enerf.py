@@ -1,4 +1,4 @@
-"""What the two layouts of Robust e-NeRF share: poses in any order, ROS's cameras, and views to evaluate with."""
+"""The parts that both layouts of Robust e-NeRF share: poses in any order, cameras of ROS, and views for evaluation."""
 
 from __future__ import annotations
 
@@ -6,41 +6,33 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.formats.json_values import parse_array
-from enerf_ns.dataparsers.formats.text_tables import FARTHEST, QUATERNION_TOLERANCE
-from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
+from enerf_ns.dataparsers.formats.columns import LATEST, unit_quaternions
+from enerf_ns.dataparsers.formats.json_values import Value, open_json
+from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_folder, image_size, of_file, read_json
+from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, image_size, of_file
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 SHORTEST_STEP = 1000
-"""Least nanoseconds between poses. ESIM states poses at the times of its inertial sensor and of its images, which may
-all but coincide; as stamps are whole nanoseconds, the speed between two such poses would be anything, and the spline
-follow."""
+"""Least time between poses, nanoseconds. ESIM states poses at the times of its inertial sensor and of its images, which
+may be almost equal. Stamps are rounded to nanoseconds, so the speed between two such poses would be arbitrary."""
 
-LATEST = 2**62
-"""Time in nanoseconds, 146 years; what lies beyond is no time."""
-
-DISTORTION_MODELS: dict[str, Literal["pinhole", "radtan", "fisheye"]] = {
-    "plumb_bob": "radtan",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-}
-"""This package's names of the distortion models, by those of ROS."""
+DISTORTION_MODELS: dict[str, CameraModel] = {"plumb_bob": "radtan", "equidistant": "fisheye", "fisheye": "fisheye"}
+"""Camera models of this package by ROS's name of the distortion model."""
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
-"""Suffixes of the images of views; the file may be named with or without."""
+"""Suffixes of the images of views; file_path states them or not."""
 
 
 def listed(names: Iterable[str]) -> str:
-    """The first of some names in order; what cannot be printed, as names in damaged files may hold, becomes "?"."""
+    """Returns the first 12 names in order; letters that cannot be printed, as in damaged files, become "?"."""
     text = ", ".join(sorted(names)[:12]) or "none"
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
@@ -52,45 +44,22 @@ def checked_trajectory(
     quaternions: Float64[np.ndarray, "poses 4"],
     notes: list[str],
 ) -> Trajectory:
-    """A trajectory from poses, camera to world, that may be out of order or come twice.
+    """Returns the trajectory of poses, camera to world, that may be out of order or repeated.
 
     Args:
-        path: The file that they come from.
+        path: The file of the poses.
         times: Nanoseconds.
         positions: Metres.
         quaternions: xyzw.
-        notes: Gets a sentence for each thing that had to be mended.
+        notes: Gets a sentence for each correction.
 
     Raises:
-        RecordingError: Fewer than two poses, a number that is not finite, a quaternion whose norm is off by more than
-            1e-3, or a time unit other than nanoseconds, by which most poses coincide.
+        RecordingError: There are fewer than two poses, a number is not finite, the norm of a quaternion is off by more
+            than 1e-3, or most poses have the same time, as in a unit other than nanoseconds.
     """
     if len(times) < 2:
         raise RecordingError(f"{path} holds {len(times)} poses, but at least 2 were expected.")
-    finite = np.isfinite(positions).all(axis=1) & np.isfinite(quaternions).all(axis=1)
-    if not finite.all():
-        raise RecordingError(
-            f"{path} holds a position or quaternion that is not finite in pose {np.argmin(finite) + 1}, where numbers "
-            "were expected."
-        )
-    if np.abs(positions).max() > FARTHEST:
-        raise RecordingError(
-            f"{path} holds a position {np.abs(positions).max():g} m from the origin, but positions within "
-            f"{FARTHEST:g} m were expected."
-        )
-    norms = np.linalg.norm(quaternions, axis=1)
-    errors = np.abs(norms - 1.0)
-    if errors.max() > QUATERNION_TOLERANCE:
-        bad = int(np.argmax(errors > QUATERNION_TOLERANCE))
-        raise RecordingError(
-            f"{path} holds a quaternion of norm {norms[bad]:.6g} in pose {bad + 1}, but rotations are unit quaternions "
-            "(qx qy qz qw)."
-        )
-    if errors.max() > 1e-6:
-        notes.append(
-            f"{(errors > 1e-6).sum():,} of {len(norms):,} quaternions in {path.name} were off norm 1 by up to "
-            f"{errors.max():.2g} and are renormalised."
-        )
+    quaternions = unit_quaternions(path, positions, quaternions, notes, lambda row: f"pose {row + 1}")
     num_backwards = np.count_nonzero(np.diff(times) < 0)
     if num_backwards:
         notes.append(f"The poses in {path.name} go back in time {num_backwards:,} times and are sorted.")
@@ -99,14 +68,14 @@ def checked_trajectory(
     dropped = len(times) - len(kept)
     if len(kept) < 2 or dropped >= len(kept):
         raise RecordingError(
-            f"{path} holds {len(times):,} poses of which {dropped:,} follow another one within 1 µs; give one "
-            "pose a time, and times in nanoseconds."
+            f"{path} holds {len(times):,} poses, but {dropped:,} of them follow another one within 1 µs; give one pose "
+            "for each time, and times in nanoseconds."
         )
     if dropped:
         notes.append(
             f"{dropped:,} of {len(times):,} poses in {path.name} follow another one within 1 µs and are left out."
         )
-    return Trajectory(times[kept], positions[kept], quaternions[kept] / norms[kept, None])
+    return Trajectory(times[kept], positions[kept], quaternions[kept])
 
 
 def checked_camera(
@@ -117,19 +86,19 @@ def checked_camera(
     distortion_model: str,
     distortion: Float[np.ndarray, " coefficients"],
 ) -> Camera:
-    """A camera from what ROS says about one.
+    """Returns the camera of a calibration as ROS states it.
 
     Args:
-        path: The file that it comes from.
+        path: The file of the calibration.
         width, height: Pixels.
         matrix: fx 0 cx, 0 fy cy, 0 0 1.
         distortion_model: plumb_bob, or equidistant, which is also called fisheye.
-        distortion: k1 k2 p1 p2 and perhaps k3 of plumb_bob, k1 to k4 of equidistant, or none for a pinhole camera.
+        distortion: k1 k2 p1 p2 and optionally k3 of plumb_bob, k1 to k4 of equidistant, or none for a pinhole camera.
 
     Raises:
-        RecordingError: The matrix is not of this form, the distortion is of another model, or all this is no camera.
+        RecordingError: The matrix has another form, the distortion has another model, or the camera is impossible.
     """
-    size: tuple[Any, Any] = width, height  # which Camera makes whole
+    size: tuple[Any, Any] = width, height  # Camera checks that they are whole
     fx, skew, cx, _, fy, cy = matrix[:2].ravel().astype(float).tolist()
     if not (np.isfinite(matrix).all() and skew == matrix[1, 0] == 0):
         raise RecordingError(
@@ -146,14 +115,14 @@ def checked_camera(
             "was expected; undistort the events and frames, or fit one of these."
         )
     with of_file(path):
-        return Camera(size[0], size[1], fx, fy, cx, cy, coefficients, model)
+        return Camera(*size, fx, fy, cx, cy, coefficients, model)
 
 
 def whole_nanoseconds(path: Path, refractory_period: float) -> int:
-    """A refractory period as an `EventRecording` holds it.
+    """Returns a refractory period (ns) of a file as a whole number.
 
     Raises:
-        RecordingError: It is not finite; the error names `path`, the file that it comes from.
+        RecordingError: It is not finite.
     """
     if not math.isfinite(refractory_period):
         raise RecordingError(f"{path} holds the refractory period {refractory_period:g} ns, but a number was expected.")
@@ -161,17 +130,17 @@ def whole_nanoseconds(path: Path, refractory_period: float) -> int:
 
 
 def read_views(folder: Path, notes: list[str]) -> Frames | None:
-    """The views to evaluate with, at times 0 s, 1 s, 2 s ... of a clock of their own.
+    """Returns the views for evaluation, at times 0 s, 1 s, 2 s ... of their own clock.
 
     Args:
-        folder: Of the recording; views/ lies in it or beside it.
-        notes: Gets a sentence if there are views that are not used, or whose transparency is dropped.
+        folder: The folder of the recording; views/ lies in it or beside it.
+        notes: Gets a sentence if there are views that are not used.
 
     Returns:
         The test views, or else the validation views; None if there are none.
 
     Raises:
-        RecordingError: Anything in the list of views cannot be used, or an image is missing or of another size.
+        RecordingError: The list of views cannot be used, or an image is missing or has another size.
     """
     check_is_folder(folder / "views", "a folder of views")
     views = next((views for views in (folder / "views", folder.parent / "views") if views.is_dir()), None)
@@ -181,70 +150,42 @@ def read_views(folder: Path, notes: list[str]) -> Frames | None:
         (file for file in (views / f"transforms_{split}.json" for split in ("test", "val")) if file.exists()), None
     )
     if path is None:
-        notes.append(f"{views} holds neither transforms_test.json nor transforms_val.json, so that no view is used.")
+        notes.append(f"{views} holds neither transforms_test.json nor transforms_val.json, so no view is used.")
         return None
-    content = read_json(path)
-    entries = content.get("frames")
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise RecordingError(f"{path} holds no list of frames; views (file_path, transform_matrix) were expected.")
+    content = open_json(path)
+    entries = content["frames"].values()
     if len(entries) < 2:
-        notes.append(f"{path} lists {len(entries)} views, of which at least 2 are needed, so that none is used.")
+        notes.append(f"{path} lists {len(entries)} views, but at least 2 are needed, so no view is used.")
         return None
-    poses = [
-        _matrix(path, entry, "transform_matrix", (4, 4), f" of frame {i}") for i, entry in enumerate(entries, start=1)
-    ]
-    for i, pose in enumerate(poses, start=1):
-        try:
-            check_rotation(pose[:3, :3])
-        except ValueError as error:
-            raise RecordingError(f"{path} holds a transform_matrix of frame {i} that {error}.") from error
-
-    files = [_find_image(views, entry.get("file_path")) for entry in entries]
+    poses = [entry["transform_matrix"].pose() for entry in entries]
+    files = [_find_image(views, entry["file_path"]) for entry in entries]
     if not any(files):
-        notes.append(f"{path} lists {len(files)} views, but none is there as .png or .jpg, so that none is used.")
+        notes.append(f"{path} lists {len(files)} views, but none is there as .png or .jpg, so no view is used.")
         return None
     if None in files:
-        missing = files.index(None)
-        raise RecordingError(
-            f"{path} lists {entries[missing].get('file_path')!r} as frame {missing + 1}, but {views} holds no such "
-            ".png or .jpg; add it or drop the frame."
-        )
+        missing = entries[files.index(None)]["file_path"]
+        raise missing.wrong(f"a .png or .jpg in {views} was")
     images = tuple(file for file in files if file)
     width, height = image_size(images[0])
-    for image in images:
-        if (found := image_size(image)) != (width, height):
-            raise RecordingError(
-                f"{image} has {found[0]} x {found[1]} pixels, but {images[0].name} has {width} x {height}; views must "
-                "be of one size."
-            )
+    check_image_sizes(images, width, height)
     rotations = Rotation.from_matrix(np.stack(poses)[:, :3, :3] * [1.0, -1.0, -1.0])
     times = np.arange(len(images), dtype=np.int64) * 10**9
     trajectory = Trajectory(times, np.stack(poses)[:, :3, 3], rotations.as_quat())
-    return Frames(images, times, _view_camera(path, content, width, height), trajectory)
+    return Frames(images, times, _view_camera(content, width, height), trajectory)
 
 
-def _view_camera(path: Path, content: dict, width: int, height: int) -> Camera:
-    if "camera_angle_x" not in content and "intrinsics" in content:
-        return checked_camera(path, width, height, _matrix(path, content, "intrinsics", (3, 3)), "", np.zeros(0))
-    angle = content.get("camera_angle_x")
-    if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not 0 < angle < np.pi:
-        raise RecordingError(
-            f"{path} holds camera_angle_x = {angle!r}, but the angle of view in radians, or intrinsics, was expected."
-        )
+def _view_camera(content: Value, width: int, height: int) -> Camera:
+    intrinsics = content.get("intrinsics")
+    if content.get("camera_angle_x") is None and intrinsics is not None:
+        return checked_camera(content.path, width, height, intrinsics.numbers((3, 3)), "", np.zeros(0))
+    value = content["camera_angle_x"]
+    angle = float(value.numbers((), expected := "the angle of view in radians, or intrinsics, was"))
+    if not 0 < angle < np.pi:
+        raise value.wrong(expected)
     focal_length = 0.5 * width / math.tan(0.5 * angle)
     return Camera(width, height, focal_length, focal_length, (width - 1) / 2, (height - 1) / 2)
 
 
-def _matrix(path: Path, entry: dict, name: str, shape: tuple[int, int], where: str = "") -> np.ndarray:
-    try:
-        return parse_array(entry.get(name), shape)
-    except ValueError as error:
-        expected = f"{shape[0]} x {shape[1]} numbers, which was expected"
-        raise RecordingError(f"{path} holds no {name}{where} of {expected}.") from error
-
-
-def _find_image(views: Path, name: object) -> Path | None:
-    if not isinstance(name, str):
-        return None
-    candidates = (views / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES)
+def _find_image(views: Path, name: Value) -> Path | None:
+    candidates = (views / f"{name.found}{suffix}" for suffix in IMAGE_SUFFIXES)
     return next((file for file in candidates if os.path.isfile(file)), None)

@@ -8,29 +8,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from enerf_ns.dataparsers.formats.columns import LATEST, unit_quaternions
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import read_text
 
 NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
 
-QUATERNION_TOLERANCE = 1e-3
-"""Largest error of the norm of a quaternion that is renormalised."""
-
-FARTHEST = 1e9
-"""Most metres that a camera may be away from the origin; beyond, splines overflow."""
-
 
 def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
-    """The cells of a table whose columns are separated by white space.
+    """Returns the cells of a table whose columns are separated by white space.
 
-    Empty lines, lines that start with "#" and a first line without any number are passed over.
+    Empty lines, lines that start with "#" and a first line without any number are ignored.
 
     Args:
         path: The file.
-        columns: Their names, separated by spaces; a row may have no fewer and no more.
+        columns: The names of the columns, separated by spaces.
 
     Returns:
-        rows, and the number of each one's line in the file, from 1.
+        The cells of each row, and the number of its line in the file, from 1.
 
     Raises:
         RecordingError: The file is missing, not text, empty, or has a row with another number of columns.
@@ -53,10 +48,10 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
 
 
 def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> Int64[np.ndarray, " rows"]:
-    """Nanoseconds from decimal text in seconds ("s"), microseconds ("us") or nanoseconds ("ns"), exact at any length.
+    """Returns nanoseconds from decimal text in the unit "s", "us" or "ns", exact at any number of digits.
 
     Raises:
-        RecordingError: A cell is no number, or a time does not lie after the one before it.
+        RecordingError: A cell is not a finite number, or the times do not increase.
     """
     times: list[int] = []
     for cell, number in zip(cells, numbers, strict=True):
@@ -66,7 +61,7 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
             time = int((Decimal(cell) * NANOSECONDS[unit]).to_integral_value())
         except (ArithmeticError, ValueError) as error:
             raise _not_a_number(path, number, cell) from error
-        if abs(time) >= 2**62:
+        if abs(time) >= LATEST:
             raise RecordingError(f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years.")
         if times and time <= times[-1]:
             raise RecordingError(
@@ -78,10 +73,10 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
 
 
 def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Float64[np.ndarray, "rows columns"]:
-    """The cells as finite float64.
+    """Returns the cells as float64.
 
     Raises:
-        RecordingError: A cell is no finite number.
+        RecordingError: A cell is not a finite number.
     """
     values = np.empty((len(rows), len(rows[0])))
     for i, (row, number) in enumerate(zip(rows, numbers, strict=True)):
@@ -93,7 +88,7 @@ def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Floa
 
 
 def read_times(path: Path, unit: str) -> Int64[np.ndarray, " rows"]:
-    """One time a line, in nanoseconds; errors as of `parse_times`."""
+    """Returns the times (ns) of a file with one time in each line; raises what `parse_times` raises."""
     rows, numbers = read_rows(path, f"t_{unit}")
     return parse_times(path, [row[0] for row in rows], numbers, unit)
 
@@ -101,51 +96,33 @@ def read_times(path: Path, unit: str) -> Int64[np.ndarray, " rows"]:
 def read_poses(
     path: Path, unit: str, notes: list[str]
 ) -> tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]:
-    """Poses, one a line: `t px py pz qx qy qz qw`, camera to world, OpenCV axes, metres.
+    """Returns the poses of a file with lines `t px py pz qx qy qz qw`: camera to world, OpenCV axes, metres.
 
     Args:
         path: The file.
-        unit: Of the times, "s", "us" or "ns".
-        notes: Gets a sentence if quaternions had to be renormalised.
+        unit: The unit of the times, "s", "us" or "ns".
+        notes: Gets a sentence if quaternions were renormalised.
 
     Returns:
-        times in nanoseconds, positions, and unit quaternions xyzw.
+        Times in nanoseconds, positions, and unit quaternions xyzw.
 
     Raises:
-        RecordingError: The file is missing or empty, has fewer than two rows, a column too few or too many, something
-            that is no finite number, times that do not increase, a position beyond 1e9 m, or a quaternion whose norm
-            is off by more than 1e-3.
+        RecordingError: The file is missing or empty, has fewer than two rows, a row with too few or too many columns,
+            a cell that is not a finite number, times that do not increase, a position beyond 1e9 m, or a quaternion
+            whose norm is off by more than 1e-3.
     """
     rows, numbers = read_rows(path, f"t_{unit} px py pz qx qy qz qw")
     if len(rows) < 2:
         raise RecordingError(f"{path} holds {len(rows)} pose, but at least 2 were expected.")
     times = parse_times(path, [row[0] for row in rows], numbers, unit)
     values = parse_numbers(path, [row[1:] for row in rows], numbers)
-    if (np.abs(values) > FARTHEST).any():
-        row, column = np.argwhere(np.abs(values) > FARTHEST)[0]
-        raise RecordingError(
-            f"{path}, line {numbers[row]} holds {rows[row][column + 1]}, but positions within {FARTHEST:g} m and unit "
-            "quaternions were expected."
-        )
-    positions, quaternions = values[:, :3], values[:, 3:]
-    norms = np.linalg.norm(quaternions, axis=1)
-    errors = np.abs(norms - 1.0)
-    if (errors > QUATERNION_TOLERANCE).any():
-        bad = int(np.argmax(errors > QUATERNION_TOLERANCE))
-        raise RecordingError(
-            f"{path}, line {numbers[bad]} holds a quaternion of norm {norms[bad]:.6g}, but rotations are unit "
-            "quaternions (qx qy qz qw)."
-        )
-    if (errors > 1e-6).any():
-        notes.append(
-            f"{(errors > 1e-6).sum():,} of {len(norms):,} quaternions in {path.name} were off norm 1 by up to "
-            f"{errors.max():.2g} and are renormalised."
-        )
-    return times, positions, quaternions / norms[:, None]
+    positions = values[:, :3]
+    quaternions = unit_quaternions(path, positions, values[:, 3:], notes, lambda row: f"line {numbers[row]}")
+    return times, positions, quaternions
 
 
 def _is_number(cell: str) -> bool:
-    """Whether a text is a number as all programs write them; Python's may have underscores and digits of any script."""
+    """Returns whether a text is a number in ASCII without underscores, which Python's `float` would allow."""
     try:
         float(cell)
     except ValueError:

@@ -1,9 +1,9 @@
 """Reader and writer of TUM-VIE: two event cameras, two cameras of grey frames, and motion capture.
 
-As it is unpacked, for the left event camera; the right one has files of its own:
+As it is unpacked, for the left event camera (the right one has its own files):
 
     <sequence>-events_left.h5             events/x, y, t and p, microseconds, polarity 0 or 1
-    <sequence>-vi_gt_data/                or what it holds, beside the events
+    <sequence>-vi_gt_data/                or its content beside the events
         mocap_data.txt                    t_us px py pz qx qy qz qw of the markers, one pose a line, metres
         left_images/*.jpg                 or .png (optional), with, in this folder or the one above,
             image_timestamps_left.txt     t_us, one frame a line
@@ -11,8 +11,8 @@ As it is unpacked, for the left event camera; the right one has files of its own
     camera-calibrationA.json              value0: intrinsics (kb4), resolution and T_imu_cam of four cameras
     mocap-imu-calibrationA.json           value0: T_imu_marker
 
-The calibrations, of which some sequences need those with a B, may also lie in `vi_gt_data` or in one of the two folders
-above. Cameras 0 and 1 take the frames on the left and on the right, 2 and 3 the events, and kb4 is OpenCV's fisheye.
+Some sequences need the calibrations with a B. The calibrations may also lie in `vi_gt_data` or in one of the two
+folders above. Cameras 0 and 1 take the left and the right frames, cameras 2 and 3 the events. kb4 is OpenCV's fisheye.
 
 As the reference code of E-NeRF prepares it, all in one folder:
 
@@ -23,12 +23,12 @@ As the reference code of E-NeRF prepares it, all in one folder:
     mocap-imu-calib.json                  the calibration of the markers as it was
     left_images_undistorted/*.png         or .jpg (optional), with stamps and exposures as above
 
-Poses are those of the markers, and a camera's pose is T_mocap_marker * inv(T_imu_marker) * T_imu_cam. The published
-stamps of all sensors lie on one clock; the time offsets that the calibrations state are not applied again.
+The poses are those of the markers. A camera's pose is T_mocap_marker * inv(T_imu_marker) * T_imu_cam. The published
+stamps of all sensors are on one clock. The time offsets in the calibrations are not applied again.
 
-A frame's time is the middle of its exposure. We found nowhere stated whether a stamp is the start, the middle or the
-end of the exposure. It is taken to be the start, which is when cameras are triggered, so that half of the exposure is
-added; E-NeRF and Robust e-NeRF, which do not read the exposures, take the stamp itself.
+A frame's time is the middle of its exposure. The data set does not state whether a stamp is the start, the middle or
+the end of the exposure. The reader takes it as the start, when cameras are triggered, and adds half of the exposure.
+E-NeRF and Robust e-NeRF do not read the exposures and take the stamp itself.
 
 Klenk et al., "TUM-VIE: The TUM stereo visual-inertial event dataset", IROS 2021; published at
 https://vision.in.tum.de/data/datasets/visual-inertial-event-dataset.
@@ -45,23 +45,22 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.formats.columns import unit_quaternions
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectify_map
-from enerf_ns.dataparsers.formats.text_tables import (
-    QUATERNION_TOLERANCE,
-    parse_numbers,
-    read_poses,
-    read_rows,
-    read_times,
-)
+from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in, read_stamps
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile, read_rectified_camera
+from enerf_ns.dataparsers.formats.json_values import Value, open_json
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_poses, read_rows
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json, encode_poses, poses_at
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_folder, image_size, of_file, read_json
+from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file
 from enerf_ns.dataparsers.recording.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/mocap_data.txt", "calib_undist.json")
+
+SIDES = ("left", "right")
 
 SENSOR_SIZE = (1280, 720)
 """Width and height of the event cameras in pixels."""
@@ -86,11 +85,11 @@ PUBLISHED_EXTRINSICS = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-"""Pose of the left frame camera in the axes of the left event camera, metres; it and the two published cameras are of
+"""Pose of the left frame camera in the axes of the left event camera, metres. It and the two cameras above are from
 camera-calibrationA, with which mocap-desk and mocap-desk2 were recorded."""
 
 WRITTEN_SEQUENCE = "simulated"
-"""Name that the files of a recording that is written begin with, in place of a sequence's."""
+"""Name of the sequence in the names of the files of a written recording."""
 
 SEQUENCES = {
     "A": ("loop-floor0", "loop-floor1", "loop-floor2", "loop-floor3", "mocap-desk", "mocap-desk2", "skate-easy"),
@@ -99,28 +98,28 @@ SEQUENCES = {
         *("running-easy", "running-hard", "skate-hard", "bike-easy", "bike-hard", "bike-dark", "floor2-dark"),
     ),
 }
-"""Names of the sequences, by the letter of the calibration that they were recorded with."""
+"""Names of the sequences, by the letter of their calibration."""
 
 CALIBRATIONS = ("camera-calibration", "mocap-imu-calibration")
 
 SHORTEST_STEP = 100_000
-"""Least nanoseconds between frames or poses (median)."""
+"""Least median time between frames or poses, nanoseconds."""
 
 BALANCE_TOLERANCE = 1.0
-"""Pixels by which intrinsics may differ from those that OpenCV gives; its versions differ by less."""
+"""Largest difference between stated intrinsics and OpenCV's, pixels. Versions of OpenCV differ by less."""
 
 
 @dataclass(frozen=True)
 class TumVieOptions(FormatOptions):
-    """What is read of a recording."""
+    """Options of the reader."""
 
     event_camera: Literal["left", "right"] = "left"
-    """Which of the two event cameras is read, with the frame camera beside it."""
+    """The event camera that is read, with the frame camera beside it."""
 
 
 @dataclass(frozen=True)
 class _Rig:
-    """What a layout's files say about the cameras of one side."""
+    """The cameras of one side, as the files of a layout state them."""
 
     camera: Camera
     """Camera of the events."""
@@ -132,16 +131,16 @@ class _Rig:
 
 
 def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> EventRecording:
-    """Reads all but the events, which are read when asked for.
+    """Reads everything but the events, which are read when they are needed.
 
     The recording's zero of time is the earliest first stamp among events, frames and poses.
 
     Args:
-        folder: With the files that the module describes.
-        event_camera: Which events; the frames are those of the same side.
+        folder: The folder with the files that the module describes.
+        event_camera: The event camera; the frames are those of the same side.
 
     Raises:
-        RecordingError: A file is missing or empty, or anything in it cannot be used.
+        RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     events_file = _find_one(folder, f"*events_{event_camera}.h5", f"events of the {event_camera} camera")
@@ -163,11 +162,12 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     if is_prepared:
         rig = _read_prepared_rig(folder, event_camera, sequence, frame_files, notes)
     else:
-        rig = _read_raw_rig(folder, data, event_camera, sequence, frame_files, notes)
+        rig = _read_raw_rig(folder, data, event_camera, sequence, bool(frame_files), notes)
     markers = Trajectory(pose_times - zero, positions, quaternions)
     marker_from_imu = np.linalg.inv(rig.imu_from_marker)
     frames = None
     if rig.frame_camera is not None:
+        check_image_sizes(frame_files, rig.frame_camera.width, rig.frame_camera.height)
         frame_trajectory = markers.of_mounted(marker_from_imu @ rig.imu_from_frame_camera)
         with of_file(images):
             frames = Frames(frame_files, frame_times - zero, rig.frame_camera, frame_trajectory, exposures=exposures)
@@ -180,30 +180,31 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         event_files=(events_file,),
         frames=frames,
         notes=tuple(notes),
-        locate_event=lambda index: f"{events_file}, event {index + 1}",
         num_events=events.num_events,
     )
 
 
 def _find_one(folder: Path, pattern: str, what: str) -> Path:
-    """The one file of a name; of several, none is better than another."""
+    """Returns the only file of a pattern; several files are an error, since none is better than another."""
     found = sorted(folder.glob(pattern))
     if not found:
         raise RecordingError(f"{folder} holds no {pattern}; a file of {what} was expected there.")
     if len(found) > 1:
         names = " and ".join(path.name for path in found[:2])
-        raise RecordingError(f"{folder} holds {len(found)} files {pattern}, such as {names}; leave the one to be read.")
+        raise RecordingError(
+            f"{folder} holds {len(found)} files {pattern}, such as {names}; leave only the one to read."
+        )
     return found[0]
 
 
 def _data_folder(folder: Path, sequence: str) -> Path:
-    """The unpacked archive of frames and poses, or the recording's folder itself where there is none."""
+    """Returns the unpacked archive of frames and poses, or the recording's folder if there is none."""
     named = folder / f"{sequence}-vi_gt_data"
     found = [named] if named.is_dir() else sorted(path for path in folder.glob("*vi_gt_data") if path.is_dir())
     if len(found) > 1:
         raise RecordingError(
-            f"{folder} holds {len(found)} folders *vi_gt_data and none of them is {named.name}; name the one that "
-            "belongs to the events so."
+            f"{folder} holds {len(found)} folders *vi_gt_data, but none of them is {named.name}; rename the one that "
+            "belongs to the events."
         )
     return found[0] if found else folder
 
@@ -213,30 +214,24 @@ def _read_frames(
 ) -> tuple[
     tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"] | None
 ]:
-    """Files, stamps, the middles of the exposures (ns on the clock of the data set, over at most `longest`), and how
-    long those are (ns), where that is known."""
-    check_is_folder(folder, "a folder of frames")
-    files = tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
+    """Returns files, stamps, middles of the exposures (both ns on the clock of the data set), and exposures (ns).
+
+    The exposures are None if they are not known. The stamps may span at most `longest` ns.
+    """
+    files = images_in(folder)
     stamps_file = _here_or_above(folder, f"image_timestamps_{side}.txt")
     if not files and not stamps_file.exists():
         return (), np.zeros(0, np.int64), np.zeros(0, np.int64), None
-    stamps = read_times(stamps_file, "us")
-    if len(stamps) != len(files):
-        raise RecordingError(
-            f"{folder} holds {len(files)} images, but {stamps_file} holds {len(stamps)} stamps; give one each."
-        )
+    stamps = read_stamps(files, stamps_file, "us", folder)
     _check_unit(stamps_file, stamps, longest)
     exposures_file = _here_or_above(folder, f"image_exposures_{side}.txt")
     if not exposures_file.exists():
-        notes.append(f"{exposures_file.name} is missing, so frames have the poses at their stamps.")
+        notes.append(f"{exposures_file.name} is missing, so each frame has the pose at its stamp.")
         return files, stamps, stamps, None
 
     rows, numbers = read_rows(exposures_file, "exposure_us")
     exposures = parse_numbers(exposures_file, rows, numbers)[:, 0]
-    if len(exposures) != len(files):
-        raise RecordingError(
-            f"{exposures_file} holds {len(exposures)} exposures, but {folder} holds {len(files)} images; give one each."
-        )
+    check_one_each(folder, len(files), exposures_file, len(exposures), "exposures")
     gap = float(np.diff(stamps).max(initial=0) or 10**9) * 1e-3
     middles = stamps + np.rint(exposures.clip(0, gap) * 500).astype(np.int64)
     fit = (exposures >= 0).all() and exposures.max() <= gap and not 0 < exposures.max() < 1
@@ -254,7 +249,7 @@ def _here_or_above(folder: Path, name: str) -> Path:
 
 
 def _check_unit(path: Path, times: Int64[np.ndarray, " rows"], longest: int) -> None:
-    """Whether rows are at least 0.1 ms apart (median) and span at most `longest` ns, as they do in the right unit."""
+    """Checks that times are at least 0.1 ms apart (median) and span at most `longest` ns, as in the right unit."""
     steps = np.diff(times)
     if len(steps) and (np.median(steps) < SHORTEST_STEP or steps.sum() > longest):
         raise RecordingError(
@@ -263,42 +258,37 @@ def _check_unit(path: Path, times: Int64[np.ndarray, " rows"], longest: int) -> 
         )
 
 
-def _read_raw_rig(
-    folder: Path, data: Path, side: str, sequence: str, frame_files: tuple[Path, ...], notes: list[str]
-) -> _Rig:
-    index = ("left", "right").index(side)
+def _read_raw_rig(folder: Path, data: Path, side: str, sequence: str, has_frames: bool, notes: list[str]) -> _Rig:
+    index = SIDES.index(side)
     camera_file, marker_file = _find_calibrations(folder, data, sequence, notes)
     calibration = _read_calibration(camera_file)
-    camera = _fisheye(camera_file, calibration, 2 + index)
-    _check_size(camera_file, camera, SENSOR_SIZE, "the event camera")
-    frame_camera = _fisheye(camera_file, calibration, index) if frame_files else None
-    _check_images(camera_file, frame_camera, frame_files)
+    camera = _fisheye(calibration, 2 + index)
+    _check_event_camera(camera_file, camera)
     return _Rig(
         camera,
-        _mount(camera_file, calibration, 2 + index),
-        frame_camera,
-        _mount(camera_file, calibration, index),
+        _pose(calibration["T_imu_cam"].values(4)[2 + index]),
+        _fisheye(calibration, index) if has_frames else None,
+        _pose(calibration["T_imu_cam"].values(4)[index]),
         _read_marker(marker_file, marker_file.name),
     )
 
 
 def _find_calibrations(folder: Path, data: Path, sequence: str, notes: list[str]) -> tuple[Path, Path]:
+    """Returns the calibrations of the cameras and of the markers."""
     folders = (folder, data, folder.parent, folder.parent.parent)
-    found = {
-        letter: [
-            next((path / f"{kind}{letter}.json" for path in folders if (path / f"{kind}{letter}.json").is_file()), None)
-            for kind in CALIBRATIONS
-        ]
-        for letter in SEQUENCES
-    }
+
+    def find(kind: str, letter: str) -> Path | None:
+        paths = (path / f"{kind}{letter}.json" for path in folders)
+        return next((path for path in paths if path.is_file()), None)
+
     letter = _letter(sequence)
     if letter is None:
-        there = [letter for letter, paths in found.items() if any(paths)]
+        there = [letter for letter in SEQUENCES if any(find(kind, letter) for kind in CALIBRATIONS)]
         if len(there) > 1:
             raise RecordingError(
-                f"{folder} has calibrations A and B at hand, and its events, called {sequence!r}, are none of the "
-                "published sequences; name the events file <sequence>-events_left.h5 or leave the calibration that "
-                "belongs to it."
+                f"{folder} can be read with calibration A or B, and its events, called {sequence!r}, are none of the "
+                "published sequences; name the events file <sequence>-events_left.h5, or leave only the calibration "
+                "of this recording."
             )
         if not there:
             raise RecordingError(
@@ -307,15 +297,16 @@ def _find_calibrations(folder: Path, data: Path, sequence: str, notes: list[str]
             )
         letter = there[0]
         notes.append(f"{sequence or folder.name} is none of the published sequences; calibration {letter} is used.")
-    for kind, path in zip(CALIBRATIONS, found[letter], strict=True):
+    found = []
+    for kind in CALIBRATIONS:
+        path = find(kind, letter)
         if path is None:
             raise RecordingError(
                 f"{folder / f'{kind}{letter}.json'} is missing, the calibration of {sequence or folder.name}; put it "
                 "there, as it is published with the data set."
             )
-    camera_file, marker_file = found[letter]
-    assert camera_file is not None and marker_file is not None
-    return camera_file, marker_file
+        found.append(path)
+    return found[0], found[1]
 
 
 def _letter(sequence: str) -> str | None:
@@ -323,45 +314,39 @@ def _letter(sequence: str) -> str | None:
 
 
 def _read_prepared_rig(folder: Path, side: str, sequence: str, frame_files: tuple[Path, ...], notes: list[str]) -> _Rig:
-    index = ("left", "right").index(side)
+    index = SIDES.index(side)
     path = folder / "calib_undist.json"
     calibration = _read_calibration(path)
-    raw_path = folder / "calibration.json" if (folder / "calibration.json").exists() else path
-    raw = _read_calibration(raw_path) if raw_path != path else calibration
-    has_raw = raw_path != path or "intrinsics" in raw
+    raw_path = folder / "calibration.json"
+    raw = _read_calibration(raw_path) if raw_path.exists() else calibration
+    has_raw = raw.get("intrinsics") is not None
 
-    fx, fy, cx, cy = _matrix(path, calibration, 2 + index)
-    rectify_map = read_rectify_map(_find_one(folder, f"*rectify_map_{side}.h5", "a rectify map"), *SENSOR_SIZE)
-    directions = (rectify_map.astype(np.float64) - [cx, cy]) / [fx, fy]
-    with of_file(f"{path}, intrinsics_undistorted[{2 + index}],"):
-        camera = Camera(*SENSOR_SIZE, fx, fy, cx, cy, model="lookup", directions=directions)
-    _check_principal_point(path, camera, "the event camera")
+    camera = _undistorted(calibration, 2 + index, *SENSOR_SIZE)
+    rectify_map = _find_one(folder, f"*rectify_map_{side}.h5", "a rectify map")
+    camera = read_rectified_camera(rectify_map, camera)
     if has_raw:
-        _check_size(raw_path, _fisheye(raw_path, raw, 2 + index), SENSOR_SIZE, "the event camera")
+        _check_event_camera(raw.path, _fisheye(raw, 2 + index))
 
     frame_camera = None
     if frame_files:
-        lens = _fisheye(raw_path, raw, index) if has_raw else None
+        lens = _fisheye(raw, index) if has_raw else None
         width, height = (lens.width, lens.height) if lens is not None else image_size(frame_files[0])
-        with of_file(f"{path}, intrinsics_undistorted[{index}],"):
-            frame_camera = Camera(width, height, *_matrix(path, calibration, index))
-        _check_images(raw_path, frame_camera, frame_files)
-        _check_principal_point(path, frame_camera, "the frames")
+        frame_camera = _undistorted(calibration, index, width, height)
         if lens is not None:
             frame_camera = _mend_balance(path, frame_camera, lens, notes)
     return _Rig(
         camera,
-        _mount(path, calibration, 2 + index),
+        _pose(calibration["T_imu_cam"].values(4)[2 + index]),
         frame_camera,
-        _mount(path, calibration, index),
+        _pose(calibration["T_imu_cam"].values(4)[index]),
         _read_marker(folder / "mocap-imu-calib.json", f"mocap-imu-calibration{_letter(sequence) or '{A,B}'}.json"),
     )
 
 
 def _mend_balance(path: Path, stated: Camera, lens: Camera, notes: list[str]) -> Camera:
-    """The camera of undistorted frames, with the intrinsics that its images have.
+    """Returns the camera of undistorted frames, with the intrinsics that the images have.
 
-    The reference code undistorts images with balance 0 of OpenCV's fisheye model, and states the intrinsics of 0.5.
+    The reference code undistorts images with balance 0 of OpenCV's fisheye model, but states the intrinsics of 0.5.
     """
     half = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
         lens.matrix, np.array(lens.distortion), (lens.width, lens.height), np.eye(3), balance=0.5
@@ -372,123 +357,76 @@ def _mend_balance(path: Path, stated: Camera, lens: Camera, notes: list[str]) ->
         return stated
     notes.append(
         f"{path.name} states the frames' intrinsics for balance 0.5 (fx {stated.fx:.2f}), but the code that writes it "
-        f"undistorts the images with balance 0, so that the intrinsics of that (fx {none.fx:.2f}) are used."
+        f"undistorts the images with balance 0, so the intrinsics of balance 0 (fx {none.fx:.2f}) are used."
     )
     return none
 
 
-def _check_size(path: Path, camera: Camera, size: tuple[int, int], what: str) -> None:
-    if (camera.width, camera.height) != size:
+def _check_event_camera(path: Path, camera: Camera) -> None:
+    if (camera.width, camera.height) != SENSOR_SIZE:
         raise RecordingError(
-            f"{path} is a calibration of {what} at {camera.width} x {camera.height} pixels, but {size[0]} x {size[1]} "
-            "were expected; give the calibration of the recording's own resolution."
+            f"{path} is a calibration of the event camera at {camera.width} x {camera.height} pixels, but "
+            f"{SENSOR_SIZE[0]} x {SENSOR_SIZE[1]} were expected; give the calibration of the recording's resolution."
         )
 
 
-def _check_images(path: Path, camera: Camera | None, files: tuple[Path, ...]) -> None:
-    for file in files:
-        assert camera is not None
-        if (found := image_size(file)) != (camera.width, camera.height):
-            raise RecordingError(
-                f"{file} has {found[0]} x {found[1]} pixels, but {camera.width} x {camera.height} as of {path} were "
-                "expected; give images and calibration of one resolution."
-            )
+def _read_calibration(path: Path) -> Value:
+    return open_json(path)["value0"]
 
 
-def _check_principal_point(path: Path, camera: Camera, what: str) -> None:
-    if not (0 < camera.cx < camera.width and 0 < camera.cy < camera.height):
+def _undistorted(calibration: Value, index: int, width: int, height: int) -> Camera:
+    """Returns the pinhole camera of the undistorted image."""
+    entry = calibration["intrinsics_undistorted"].values(4)[index]
+    camera = entry.camera((width, height), entry.each("fx", "fy", "cx", "cy"))
+    if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise RecordingError(
-            f"{path} holds the principal point ({camera.cx:g}, {camera.cy:g}) for {what}, which lies outside their "
-            f"{camera.width} x {camera.height} pixels; give the calibration of this resolution."
+            f"{entry.path} holds in {entry.name} the principal point ({camera.cx:g}, {camera.cy:g}), which lies "
+            f"outside the {width} x {height} pixels; give the calibration of this resolution."
         )
+    return camera
 
 
-def _read_calibration(path: Path) -> dict:
-    content = read_json(path)
-    if not isinstance(content.get("value0"), dict):
-        raise RecordingError(f"{path} holds no object value0, but a calibration of TUM-VIE was expected.")
-    return content["value0"]
+def _fisheye(calibration: Value, index: int) -> Camera:
+    entry = calibration["intrinsics"].values(4)[index]
+    entry["camera_type"].choice(("kb4",))
+    intrinsics = entry["intrinsics"].each("fx", "fy", "cx", "cy")
+    distortion = entry["intrinsics"].each("k1", "k2", "k3", "k4")
+    return entry.camera(
+        calibration["resolution"].values(4)[index].numbers((2,)).tolist(), intrinsics, distortion, "fisheye"
+    )
 
 
-def _entry(path: Path, calibration: dict, name: str, index: int) -> dict:
-    entries = calibration.get(name)
-    if not isinstance(entries, list) or len(entries) != 4 or not isinstance(entries[index], dict):
-        raise RecordingError(
-            f"{path} holds no {name} of camera {index}, but a calibration of four cameras (0 to 3) was expected."
-        )
-    return entries[index]
-
-
-def _numbers(path: Path, entry: dict, names: str, what: str) -> list[float]:
-    for name in names.split():
-        value = entry.get(name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1e9 < value < 1e9:
-            raise RecordingError(f"{path} holds {name} = {value!r} in {what}, where a number was expected.")
-    return [float(entry[name]) for name in names.split()]
-
-
-def _matrix(path: Path, calibration: dict, index: int) -> tuple[float, float, float, float]:
-    entry = _entry(path, calibration, "intrinsics_undistorted", index)
-    fx, fy, cx, cy = _numbers(path, entry, "fx fy cx cy", f"intrinsics_undistorted[{index}]")
-    return fx, fy, cx, cy
-
-
-def _fisheye(path: Path, calibration: dict, index: int) -> Camera:
-    entry = _entry(path, calibration, "intrinsics", index)
-    model, parameters = entry.get("camera_type"), entry.get("intrinsics")
-    if model != "kb4" or not isinstance(parameters, dict):
-        raise RecordingError(f"{path} holds a camera of type {model!r} as intrinsics[{index}], but kb4 was expected.")
-    what = f"intrinsics[{index}]"
-    fx, fy, cx, cy, *distortion = _numbers(path, parameters, "fx fy cx cy k1 k2 k3 k4", what)
-    sizes = calibration.get("resolution")
-    size = sizes[index] if isinstance(sizes, list) and len(sizes) == 4 else None
-    if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int for side in size)):
-        raise RecordingError(
-            f"{path} holds resolution[{index}] = {size}, but width and height in pixels were expected."
-        )
-    with of_file(f"{path}, {what},"):
-        return Camera(size[0], size[1], fx, fy, cx, cy, tuple(distortion), "fisheye")
-
-
-def _mount(path: Path, calibration: dict, index: int) -> Float64[np.ndarray, "4 4"]:
-    """T_imu_cam of a camera."""
-    return _pose(path, _entry(path, calibration, "T_imu_cam", index), f"T_imu_cam[{index}]")
-
-
-def _pose(path: Path, entry: dict, what: str) -> Float64[np.ndarray, "4 4"]:
-    values = _numbers(path, entry, "px py pz qx qy qz qw", what)
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-        raise RecordingError(
-            f"{path} holds a quaternion of norm {norm:.6g} as {what}, but rotations are unit quaternions (qx qy qz qw)."
-        )
+def _pose(entry: Value) -> Float64[np.ndarray, "4 4"]:
+    """Returns the matrix of a position px py pz (metres) and a quaternion qx qy qz qw."""
+    position = np.array([entry.each("px", "py", "pz")])
+    quaternion = np.array([entry.each("qx", "qy", "qz", "qw")])
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-    pose[:3, 3] = values[:3]
+    rotation = unit_quaternions(entry.path, position, quaternion, [], lambda _: entry.name)
+    pose[:3, :3] = Rotation.from_quat(rotation[0]).as_matrix()
+    pose[:3, 3] = position[0]
     return pose
 
 
 def _read_marker(path: Path, published: str) -> Float64[np.ndarray, "4 4"]:
-    """T_imu_marker from the calibration of the markers.
+    """Returns T_imu_marker from the calibration of the markers.
 
     Args:
         path: The calibration of the markers.
-        published: Its name in the data set.
+        published: The name of this file in the data set.
     """
     if not path.exists():
         raise RecordingError(f"{path} is missing; put a copy of {published}, published with the data set, there.")
     calibration = _read_calibration(path)
-    entry = calibration.get("T_imu_marker")
-    if not isinstance(entry, dict):
-        found = "is a calibration of the cameras and" if "T_imu_cam" in calibration else "holds value0 but"
+    if calibration.get("T_imu_marker") is None:
         raise RecordingError(
-            f"{path} {found} states no T_imu_marker; replace it by {published}, published with the data set."
+            f"{path} states no T_imu_marker, so it is no calibration of the markers; replace it by {published}, "
+            "published with the data set."
         )
-    return _pose(path, entry, "T_imu_marker")
+    return _pose(calibration["T_imu_marker"])
 
 
 class TumVieWriter(Writer):
-    """Writer of TUM-VIE as it is unpacked: its left cameras. Markers, IMU and event camera are in one place."""
+    """Writer of TUM-VIE as it is unpacked, with the left cameras. Markers, IMU and event camera share one pose."""
 
     layout = "tum_vie"
     poses_per_second = 120
@@ -541,7 +479,7 @@ class TumVieWriter(Writer):
         return {path: blurred, f"sharp_images/{self._name(number)}.png": sharp}
 
     def _stamps(self, time: int) -> dict[str, str]:
-        """Exposures begin at the stamps, which are such that their middles are closest to the frames' times."""
+        """Returns stamps at the start of exposures, in µs, chosen so that the middles are closest to `time`."""
         exposure = round(self.setup.exposure / 1000)
         stamp = (2 * time - 1000 * exposure + 1000) // 2000
         folder = f"{self._data}/left_images"

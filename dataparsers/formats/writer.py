@@ -1,23 +1,21 @@
-"""Writes a recording as it comes, in pieces: what the writers of all layouts share.
+"""The common part of the writers of all layouts, which write a recording in pieces.
 
-Calibration and poses are there from the beginning, and events and frames are added in pieces, so that memory does not
-grow with duration, and what was written can be read when the disk is full or the process is stopped.
+Calibration and poses are written first. Events and frames follow in pieces, so memory does not grow with duration. The
+files can be read even if the disk becomes full or the process is stopped.
 
-Beside what a layout has, in all of them, with files named by the numbers of the frames:
+Every layout also holds these files, with the numbers of frames as names:
 
-    simulation.json     the true contrast thresholds and all settings, cameras and extrinsics; "finished" is false, and
-                        the numbers of events and frames are not final, if the simulation was broken off
+    simulation.json     the true contrast thresholds and all settings, cameras and extrinsics; if the simulation was
+                        interrupted, "finished" is false, and the numbers of events and frames are not final
     thresholds.npy      float32 [2, height, width], on and off threshold of each pixel of the event camera, if they vary
     depth/              .npy, float32 [height, width], z-depth in metres of each frame, 0 where nothing was hit
-    sharp_images/       .png, in eds and tum_vie, whose own frames are blurred as those of a real camera
-    hdr/, hdr_blurred/  .npy, float32 linear brightness of frames, R G B if in colour, and .exr where OpenCV writes that
-                        (it does with OPENCV_IO_ENABLE_OPENEXR=1 in the environment)
+    sharp_images/       .png, in eds and tum_vie, whose own frames are blurred like those of a real camera
+    hdr/, hdr_blurred/  .npy, float32 linear brightness of frames, R G B if in colour
 """
 
 from __future__ import annotations
 
 import json
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -41,83 +39,73 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 CAMERA_KEYS = ("width", "height", "model", "fx", "fy", "cx", "cy")
 MOUNTING_KEY = "event_camera_from_frame_camera"
 
-FEWEST_FRAMES, FEWEST_POSES = 11, 101
-"""Fewest frames and poses that the reference code of E-NeRF accepts."""
-
-LARGEST_SMALL_SIDE, LARGEST_SMALL_CENTRE = 200, 100
-"""Width or height, and place of the principal point, in pixels, that it does not accept yet."""
-
 Rig = tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]
-"""Cameras of events and of frames, and the pose of the latter in the axes of the former."""
+"""Event camera, frame camera, and the pose of the frame camera in the axes of the event camera."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known of a recording before the first picture."""
+    """The properties of a recording that are known before the first frame."""
 
     event_camera: Camera
     frame_camera: Camera
     event_from_frame: Float64[np.ndarray, "4 4"]
     """Extrinsics: pose of the frame camera in the axes of the event camera, metres."""
     trajectory: Trajectory | None
-    """Trajectory of the event camera; None for a source without poses, whose recording then lacks them too."""
+    """Trajectory of the event camera; None for a source without poses, whose recording then has none."""
     frame_times: Int64[np.ndarray, " frames"]
     """Times of the frames, ns, increasing: the middles of the exposures."""
     exposure: int
-    """Exposure of the blurred frames, ns; 0 for sharp frames alone."""
+    """Exposure of the blurred frames, ns; 0 if there are only sharp frames."""
     contrast_thresholds: tuple[float, float]
     """Contrast thresholds of on and of off events."""
     pixel_thresholds: Float32[np.ndarray, "2 height width"] | None = None
     """Contrast thresholds of each pixel for on and for off events, if they vary."""
     refractory_period: int = 0
-    """For how long a pixel is blind after an event, ns."""
+    """Refractory period, ns."""
     bayer_pattern: str | None = None
     """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1), (1, 1), such as RGGB; None for a grey camera."""
     response: str | None = None
-    """How the event camera answers brightness, as `EventRecording.response` has it, where that is known."""
+    """Response of the event camera to brightness, as in `EventRecording.response`; None if it is not known."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """All else that simulation.json shall state; values that JSON can hold."""
+    """Further entries of simulation.json; values that JSON can hold."""
 
 
 class Writer(ABC):
-    """A recording that is being written, in a `with` statement at whose end it is finished.
+    """A recording that is being written. Use it in a `with` statement, whose end finishes the recording.
 
     Args:
-        folder: Exists and is empty.
-        setup: What is recorded.
+        folder: An empty folder.
+        setup: The properties of the recording.
 
     Raises:
-        FlagError: The layout cannot hold these cameras or that few frames, or the extrinsics are no rigid motion.
-        OutputError: The disk is full; the methods raise it too.
+        FlagError: The layout cannot hold these cameras or so few frames, or the extrinsics are not a rigid motion.
+        OutputError: The disk is full. The methods raise it too.
     """
 
     layout: ClassVar[str]
     """Name of the format that reads the layout."""
     start: ClassVar[int] = 0
-    """What the clock of the layout shows (ns) when the simulation's is at 0."""
+    """Time (ns) in the files of the layout at the simulation's time 0."""
     fewest_frames: ClassVar[int] = 1
-    """Fewest frames that others who read this layout accept."""
-    fills_up_poses: ClassVar[bool] = False
-    """Whether poses are added where there are fewer than `FEWEST_POSES`."""
-    is_of_reference: ClassVar[bool] = True
-    """Whether the reference code of E-NeRF reads this layout."""
+    """Least number of frames that other readers of this layout accept."""
     poses_per_second: ClassVar[int | None] = None
-    """Poses a second, as many as the data set has, where it has a fixed number."""
+    """Rate of poses of the data set, per second; None if it is not fixed."""
     published_rig: ClassVar[Rig | None] = None
-    """The cameras of the data set, where it has its own."""
+    """The published cameras of the data set; None if it has none."""
     frame_folders: ClassVar[tuple[str, str]]
-    """Folders of the sharp and of the blurred frames, of layouts that have one for each."""
+    """Folders of the sharp and of the blurred frames, in layouts that have both."""
     stamps_name: ClassVar[str]
-    """Name of the table of stamps in each of those."""
+    """Name of the table of stamps in each frame folder."""
     events_held: ClassVar[int] = 2**16
-    """Events that are held back until they are written, and those in a chunk of an HDF5 file."""
+    """Number of events that are written together; also the chunk size of an HDF5 file."""
 
     num_events: int = 0
     """Number of events added so far."""
     num_frames: int = 0
     """Number of frames added so far."""
     notes: list[str]
-    """What the user should know, one sentence each."""
+    """Sentences for the user."""
 
     def __init__(self, folder: Path, setup: Setup):
         self.folder, self.setup, self.notes = folder, setup, []
@@ -142,16 +130,14 @@ class Writer(ABC):
                 self._replace("thresholds.npy", encode_npy(setup.pixel_thresholds))
             self._write_summary(finished=False)
             self._event_files = self._open_events()
-        if self.is_of_reference and (reasons := self._reasons_against_reference()):
-            self.notes.append(f"The reference code of E-NeRF does not read this recording: {'; '.join(reasons)}.")
 
     @property
     def depth_range(self) -> tuple[float, float] | None:
-        """Smallest and largest depth (metres) of the frames so far; None unless there are two."""
+        """Smallest and largest depth (metres) of the frames so far; None if there are no two values."""
         return (self._near, self._far) if self._near < self._far else None
 
     def add_events(self, events: Events) -> None:
-        """Adds events that lie after those added before. Memory for up to `events_held` of them is held back."""
+        """Adds events that follow the events added before. Up to `events_held` of them wait in memory."""
         if not len(events):
             return
         self.num_events += len(events)
@@ -171,17 +157,17 @@ class Writer(ABC):
         linear: tuple[Float[np.ndarray, "height width *channels"], Float[np.ndarray, "height width *channels"] | None]
         | None = None,
     ) -> None:
-        """Adds the next frame, completely or, if that fails, not at all.
+        """Adds the next frame completely or, after an error, not at all.
 
         Args:
-            number: From 0.
-            time: ns, as of the setup.
-            sharp: The frame as the sensor reads it out, at that time.
-            blurred: The frame with the setup's exposure; None if that is 0.
-            depth: z-depth in metres that the frame camera sees at the frame's time, 0 where nothing is hit; None for a
-                source that knows none.
-            linear: Linear brightness of the sharp and of the blurred frame, kept for its high dynamic range; None: it
-                is not kept.
+            number: Number of the frame, from 0.
+            time: Time of the frame in the setup, ns.
+            sharp: The frame at this time without exposure.
+            blurred: The frame with the setup's exposure; None if the exposure is 0.
+            depth: z-depth in metres of the frame camera at this time, 0 where nothing is hit; None for a source without
+                depth.
+            linear: Linear brightness of the sharp and of the blurred frame, which is written to hdr/ and hdr_blurred/.
+                Default: it is not written.
         """
         assert number == self.num_frames and time == self.setup.frame_times[number]
         assert (blurred is None) == (self.setup.exposure == 0)
@@ -191,7 +177,7 @@ class Writer(ABC):
         }
         for folder, brightness in zip(("hdr", "hdr_blurred"), linear or (), strict=False):
             if brightness is not None:
-                files |= self._encode_hdr(f"{folder}/{name}", brightness)
+                files[f"{folder}/{name}.npy"] = encode_npy(brightness)
         if depth is not None:
             files[f"depth/{name}.npy"] = encode_npy(depth)
         with self._writing():
@@ -206,7 +192,7 @@ class Writer(ABC):
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
-        """Finishes the recording; of one that was broken off, what is there is kept."""
+        """Finishes the recording. After an error, the files that are there are kept."""
         try:
             with self._writing(), ExitStack() as stack:
                 stack.callback(self._write_summary, finished=kind is None)
@@ -229,38 +215,22 @@ class Writer(ABC):
     @abstractmethod
     def _open_events(self) -> EventFiles: ...
 
-    def _write_depth_range(self) -> None:  # noqa: B027  (a layout that states no range does nothing)
-        """Writes what states the range of depth, where the layout does; called when there is one, and at the end."""
+    def _write_depth_range(self) -> None:  # noqa: B027  (the default does nothing)
+        """Writes the range of depth if the layout states it; called when a range is known, and at the end."""
 
     def _images(self, number: int, sharp: np.ndarray, blurred: np.ndarray | None) -> dict[str, np.ndarray]:
-        """The images of a frame, by path."""
+        """Returns the images of a frame by path."""
         images = zip(self.frame_folders, (sharp, blurred), strict=True)
         return {f"{folder}/{self._name(number)}.png": image for folder, image in images if image is not None}
 
     def _stamps(self, time: int) -> dict[str, str]:
-        """What each table of frames gets for one at this time (ns), by path."""
+        """Returns the lines that a frame at this time (ns) adds to tables, by path."""
         folders = self.frame_folders if self.setup.exposure else self.frame_folders[:1]
         return {f"{folder}/{self.stamps_name}": f"{time}\n" for folder in folders}
 
     def _name(self, number: int) -> str:
-        """Name of a frame's files, such that they sort as their numbers do."""
+        """Returns the name of a frame's files, which sorts by the number."""
         return f"{number:0{max(5, len(str(len(self.setup.frame_times) - 1)))}d}"
-
-    def _reasons_against_reference(self) -> list[str]:
-        """What the reference code of E-NeRF asserts and does not find."""
-        setup, camera, reasons = self.setup, self.setup.event_camera, []
-        num_frames, num_poses = len(setup.frame_times), len(setup.trajectory.times) if setup.trajectory else 0
-        if num_frames < FEWEST_FRAMES:
-            reasons.append(f"it wants {FEWEST_FRAMES} frames or more, and there are {num_frames}")
-        if num_poses < FEWEST_POSES and not (self.fills_up_poses and num_poses):
-            reasons.append(f"it wants {FEWEST_POSES} poses or more, and there are {num_poses}")
-        if min(camera.width, camera.height) <= LARGEST_SMALL_SIDE or min(camera.cx, camera.cy) <= LARGEST_SMALL_CENTRE:
-            reasons.append(
-                f"it wants more than {LARGEST_SMALL_SIDE} pixels along both sides and a centre beyond "
-                f"{LARGEST_SMALL_CENTRE}, and there are {camera.width} x {camera.height} with the centre at "
-                f"({camera.cx:g}, {camera.cy:g})"
-            )
-        return reasons
 
     def _check_size(self, size: tuple[int, int]) -> None:
         camera = self.setup.event_camera
@@ -301,22 +271,14 @@ class Writer(ABC):
             self._pending, self._num_pending = [], 0
             self._event_files.append(events)
 
-    def _encode_hdr(self, stem: str, brightness: np.ndarray) -> dict[str, bytes]:
-        files = {f"{stem}.npy": encode_npy(brightness)}
-        if _exr_enabled():
-            files[f"{stem}.exr"] = _encode(".exr", brightness.astype(np.float32))
-        elif NO_EXR not in self.notes:
-            self.notes.append(NO_EXR)
-        return files
-
     def _to_us(self, times: Int64[np.ndarray, " times"]) -> Int64[np.ndarray, " times"]:
-        """The nearest microseconds within the poses, on the simulation's clock."""
+        """Returns times in whole microseconds, rounded and clipped to the trajectory, on the simulation's clock."""
         rounded, trajectory = (times + 500) // 1000, self.setup.trajectory
         return rounded if trajectory is None else rounded.clip(-(-trajectory.start // 1000), trajectory.end // 1000)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turns errors of the disk and of the HDF5 library into one sentence."""
+        """Turns errors of the disk and of the HDF5 library into one OutputError."""
         try:
             yield
         except (OSError, RuntimeError) as error:
@@ -329,16 +291,16 @@ class Writer(ABC):
 
 
 class EventFiles(Protocol):
-    """Where events go. What was appended can be read at once or, in HDF5, when a chunk is full."""
+    """The files of events. Appended events can be read at once or, in HDF5, when a chunk is full."""
 
     def append(self, events: Events) -> None: ...
 
     def close(self) -> None:
-        """Closes the files; whatever has happened before, as many of each column can be read afterwards."""
+        """Closes the files. All columns then have the same length, even after an error."""
 
 
 class GrowingArray:
-    """A .npy file without rows, new or there already, that grows by rows and holds those that were committed."""
+    """A .npy file, new or existing, that grows by rows. Its header states the number of committed rows."""
 
     def __init__(self, path: Path, dtype: type, columns: tuple[int, ...] = ()):
         self._dtype, self._columns, self.num_rows = np.dtype(dtype), columns, 0
@@ -347,7 +309,7 @@ class GrowingArray:
         self._file = open(path, "r+b", buffering=0)
 
     def append(self, rows: np.ndarray) -> None:
-        """Writes rows after those that were committed."""
+        """Writes rows after the committed rows."""
         row_bytes = self._dtype.itemsize * int(np.prod(self._columns))
         self._file.seek(len(self._header(0)) + self.num_rows * row_bytes)
         write_all(self._file, rows.astype(self._dtype).tobytes())
@@ -362,7 +324,7 @@ class GrowingArray:
         self._file.close()
 
     def _header(self, num_rows: int) -> bytes:
-        """Header of the file; NumPy leaves room in it for any number of rows, so that it stays as long as it is."""
+        """Returns the header. NumPy reserves space in it for any number of rows, so its length is constant."""
         about = {"descr": self._dtype.str, "fortran_order": False, "shape": (num_rows, *self._columns)}
         header = BytesIO()
         np.lib.format.write_array_header_1_0(header, about)
@@ -370,28 +332,28 @@ class GrowingArray:
 
 
 def is_second_camera(event_camera: Camera, frame_camera: Camera, event_from_frame: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether frames are taken by another camera, or from another place, than events."""
+    """Returns whether the frame camera differs from the event camera in its calibration or its pose."""
     return frame_camera != event_camera or bool((event_from_frame != np.eye(4)).any())
 
 
 def camera_json(camera: Camera) -> dict[str, Any]:
-    """A camera as recording.json and simulation.json state it."""
+    """Returns a camera as recording.json and simulation.json state it."""
     about = {key: getattr(camera, key) for key in CAMERA_KEYS}
     return {**about, "distortion": list(camera.distortion)} if camera.distortion else about
 
 
 def mounted_camera_json(camera: Camera, event_from_frame: Float64[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """A camera that is fixed to the event camera, with its pose in the axes of that one."""
+    """Returns the JSON object of a camera that is fixed to the event camera, with its pose there."""
     return {**camera_json(camera), MOUNTING_KEY: event_from_frame.tolist()}
 
 
 def encode_json(value: dict[str, Any]) -> bytes:
-    """Content of a JSON file; numbers keep all their digits."""
+    """Returns the content of a JSON file; numbers keep all digits."""
     return (json.dumps(value, indent=2) + "\n").encode()
 
 
 def encode_npy(array: Shaped[np.ndarray, "..."], dtype: type = np.float32) -> bytes:
-    """Content of a .npy file."""
+    """Returns the content of a .npy file."""
     content = BytesIO()
     np.save(content, array.astype(dtype))
     return content.getvalue()
@@ -403,11 +365,11 @@ def encode_poses(
     positions: Float64[np.ndarray, "poses 3"],
     quaternions: Float64[np.ndarray, "poses 4"],
 ) -> bytes:
-    """A table of poses, one a line, of which reading gives the same numbers.
+    """Returns a table with one pose in each line, with all digits.
 
     Args:
-        header: First line.
-        stamps: Times as they shall stand there.
+        header: The first line.
+        stamps: The times as written in the table.
         positions: Metres.
         quaternions: xyzw.
     """
@@ -417,7 +379,7 @@ def encode_poses(
 
 
 def encode_tum(trajectory: Trajectory) -> bytes:
-    """A trajectory as text of the TUM benchmark: t px py pz qx qy qz qw a line, seconds and metres."""
+    """Returns a trajectory as text of the TUM benchmark: lines t px py pz qx qy qz qw, seconds and metres."""
     stamps = (f"{'-' * (time < 0)}{abs(time) // 10**9}.{abs(time) % 10**9:09d}" for time in trajectory.times.tolist())
     return encode_poses("# t px py pz qx qy qz qw", stamps, trajectory.positions, trajectory.quaternions)
 
@@ -425,29 +387,13 @@ def encode_tum(trajectory: Trajectory) -> bytes:
 def poses_at(
     trajectory: Trajectory, times: Int64[np.ndarray, " times"]
 ) -> tuple[Float64[np.ndarray, "times 3"], Float64[np.ndarray, "times 4"]]:
-    """Positions (metres), and quaternions xyzw, of a trajectory at other times (ns) than its own."""
+    """Returns positions (metres) and quaternions xyzw of a trajectory, interpolated at any times (ns)."""
     poses = trajectory.poses(torch.from_numpy(times)).numpy()
     return poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]).as_quat()
 
 
-NO_EXR = (
-    "Frames of high dynamic range are written as .npy alone, since OpenCV writes no .exr here unless "
-    "OPENCV_IO_ENABLE_OPENEXR=1 is set."
-)
-
-
-def _exr_enabled() -> bool:
-    """OpenCV raises, and prints a warning, where it was not told to."""
-    if not os.environ.get("OPENCV_IO_ENABLE_OPENEXR"):
-        return False
-    try:
-        return cv2.haveImageWriter(".exr")
-    except cv2.error:
-        return False
-
-
 def _encode(kind: str, image: np.ndarray) -> bytes:
-    """Content of an image file, of JPEG the best that there is; OpenCV keeps colours as B G R."""
+    """Returns the content of an image file, with the best quality for JPEG."""
     best = (cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     done, content = cv2.imencode(kind, image[..., ::-1] if image.ndim == 3 else image, best if kind == ".jpg" else ())
     assert done

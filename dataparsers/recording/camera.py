@@ -1,4 +1,4 @@
-"""Camera models: where each pixel looks, and images without lens distortion."""
+"""Camera models: the direction of each pixel, and images without lens distortion."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Shaped
 
 ROUND_TRIP_TOLERANCE = 1e-6
-"""Most pixels between a pixel and the projection of its direction."""
+"""Largest distance between a pixel and the projection of its direction, pixels."""
 
 SHORTEST_FOCAL_LENGTH, LONGEST_FOCAL_LENGTH = 0.01, 1e4
-"""Shortest and longest focal length, as a multiple of the width, or of the height: a view of 179 degrees, and one of
-0.006."""
+"""Shortest and longest focal length, as a multiple of the width or height: views of 179 and of 0.006 degrees."""
 
 FARTHEST_PRINCIPAL_POINT = 10
-"""Farthest that the principal point may lie from the middle of the image, as a multiple of its width or height."""
+"""Largest distance of the principal point from the middle of the image, as a multiple of the width or height."""
 
 STEEPEST_DIRECTION = 1e4
-"""Largest x / z and y / z of the direction in which a pixel looks."""
+"""Largest x / z and y / z of the direction of a pixel."""
 
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry by which the product of a rotation and its transpose may differ from one."""
+"""Largest entry of the difference between R times its transpose and the identity, for a rotation R."""
 
 LARGEST_SIDE = 2**16 - 1
-"""Most pixels along a side of a camera; larger columns and rows do not fit the types that events are stored in."""
+"""Largest width or height of a camera, pixels. Larger coordinates do not fit the types of stored events."""
 
 MOST_PIXELS = 2**26
-"""Most pixels of a camera: more than ten times those of any event camera, and what a gigabyte holds the counts of."""
+"""Largest number of pixels of a camera: more than ten times those of any event camera."""
 
 COEFFICIENTS = {
     "pinhole": ((0,), "no coefficients"),
@@ -38,15 +37,14 @@ COEFFICIENTS = {
     "fisheye": ((4,), "finite numbers k1 k2 k3 k4"),
     "lookup": ((0,), "no coefficients"),
 }
-"""How many numbers the distortion of each model may have, and the same in words."""
+"""Possible numbers of distortion coefficients of each model, and the coefficients in words."""
 
 CHECKED_STEP = 16
-"""Pixels from one to the next of those at which a camera, when it is made, is checked to be a lens; its corners are
-among them."""
+"""Step between the pixels at which the constructor checks that the distortion has an inverse. It checks all corners."""
 
 INVERSION_STEPS = 60
-"""Steps in which a table of directions is inverted; each halves the error where the table is even, and lessens it up to
-fourfold stretching."""
+"""Iterations that invert a table of directions. Each halves the error of an even table. They converge if the table is
+stretched up to fourfold."""
 
 
 CameraModel = Literal["pinhole", "radtan", "fisheye", "lookup"]
@@ -57,8 +55,8 @@ class Camera:
     """A calibrated camera, in OpenCV's conventions: integer pixel indices are pixel centres.
 
     Raises:
-        ValueError: The size is not of whole pixels, a focal length is not above 0, the distortion has not as many
-            finite coefficients as the model, or all this fits no lens; a sentence that can follow "FILE holds".
+        ValueError: The size is not in whole pixels, a focal length is not above 0, the number of finite distortion
+            coefficients does not fit the model, or the camera fits no lens. The message can follow "FILE holds".
     """
 
     width: int
@@ -76,8 +74,8 @@ class Camera:
     (Kannala-Brandt)."""
     model: CameraModel = "pinhole"
     directions: Float64[np.ndarray, "height width 2"] | None = field(default=None, compare=False)
-    """For the model lookup: x / z and y / z of where each pixel looks; fx to cy are then those of the undistorted
-    camera."""
+    """For the model lookup: x / z and y / z of the direction of each pixel. Then fx, fy, cx and cy are the intrinsics
+    of the undistorted camera."""
 
     def __post_init__(self) -> None:
         if not all(0 < side <= LARGEST_SIDE and side == int(side) for side in (self.width, self.height)):
@@ -119,22 +117,22 @@ class Camera:
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 3"]:
-        """Projects camera coordinates with z = 1 to pixels, for a camera without distortion."""
+        """The intrinsic matrix, which projects camera coordinates with z = 1 to pixels without distortion."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def pixel_directions(self) -> Float64[np.ndarray, "height width 3"]:
-        """Where the centre of each pixel looks: camera axes (x right, y down, z forward), z = 1, not normalised.
+        """Returns the direction of each pixel's centre: camera axes (x right, y down, z forward), with z = 1.
 
         Raises:
-            ValueError: The distortion has no inverse at some pixel, so that the calibration cannot be right; a sentence
-                that can follow "FILE holds".
+            ValueError: The distortion has no inverse at some pixel, so the calibration is wrong. The message can follow
+                "FILE holds".
         """
         return self._pixel_directions.copy()
 
     def pixel_steps(self) -> tuple[Float64[np.ndarray, "height width 2"], Float64[np.ndarray, "height width 2"]]:
-        """By how much `pixel_directions` (x, y) change from a column to the next, and from a row to the next.
+        """Returns the change of `pixel_directions` (x, y) from each column to the next, and from each row to the next.
 
-        By central differences, which for a camera without distortion are exact.
+        The method uses central differences, which are exact for a camera without distortion.
         """
         directions = self._pixel_directions[..., :2]
 
@@ -154,23 +152,23 @@ class Camera:
 
     def _check_directions(self) -> None:
         if self.directions is None:
-            raise ValueError("a camera of the model lookup without a table of where each pixel looks; give one.")
+            raise ValueError("a camera of the model lookup without a table of directions of its pixels; give one.")
         shape = (self.height, self.width, 2)
         if self.directions.shape != shape or not np.isfinite(self.directions).all():
             raise ValueError(
-                f"a table of where each pixel of a camera looks of shape {self.directions.shape}, but finite numbers "
-                f"of shape (height, width, 2) = {shape} were expected."
+                f"a table of directions of pixels of shape {self.directions.shape}, but finite numbers of shape "
+                f"(height, width, 2) = {shape} were expected."
             )
         if not np.abs(self.directions).max() < STEEPEST_DIRECTION:
             raise ValueError(
-                f"a table of where each pixel of a camera looks, in which x / z and y / z reach "
+                f"a table of directions of pixels, in which x / z and y / z reach "
                 f"{np.abs(self.directions).max():g}, which fits no lens; make it again."
             )
 
     def _directions_at(
         self, columns: Int[np.ndarray, "rows columns"], rows: Int[np.ndarray, "rows columns"]
     ) -> Float64[np.ndarray, "rows columns 3"]:
-        """Where some pixels look, by the lens; ValueError where it has no inverse there."""
+        """Returns the directions of some pixels; raises ValueError if the distortion has no inverse there."""
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(float)
         coefficients = np.array(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
@@ -194,14 +192,15 @@ class Camera:
         return directions.reshape(*columns.shape, 3)
 
     def without_lens(self) -> Camera:
-        """The pinhole camera of the same focal lengths and principal point, as if the lens did not distort."""
+        """Returns the pinhole camera with the same focal lengths and principal point."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def undistorted(self) -> Camera:
-        """The pinhole camera of the same size whose image holds only pixels that this camera sees; itself if pinhole.
+        """Returns the pinhole camera of the same size whose image holds only pixels that this camera sees.
 
-        OpenCV's `getOptimalNewCameraMatrix` with alpha = 0; for fisheye, `estimateNewCameraMatrixForUndistortRectify`
-        with balance = 0. A lookup camera states it.
+        The matrix is from OpenCV's `getOptimalNewCameraMatrix` with alpha = 0 or, for fisheye, from
+        `estimateNewCameraMatrixForUndistortRectify` with balance = 0. A lookup camera states the matrix itself. A
+        pinhole camera is returned unchanged.
         """
         if self.model == "pinhole":
             return self
@@ -220,7 +219,7 @@ class Camera:
     def undistort(
         self, image: Shaped[np.ndarray, "height width channels"]
     ) -> Shaped[np.ndarray, "height width channels"]:
-        """The image as the camera `undistorted()` would have taken it, bilinearly interpolated, of the same type."""
+        """Returns the image of the camera `undistorted()`, bilinearly interpolated, of the same type."""
         if self.model == "pinhole":
             return image
         if self.model == "lookup":
@@ -232,13 +231,14 @@ class Camera:
         return cv2.undistort(image, self.matrix, coefficients, newCameraMatrix=matrix).reshape(image.shape)
 
     def downscaled(self, factor: float) -> Camera:
-        """The pinhole camera whose pixels are as many times as wide and high, where this one is a pinhole camera.
+        """Returns this pinhole camera with larger pixels.
 
         Args:
-            factor: At least 1; of the right and the lower border is left out what fills no whole pixel.
+            factor: Width of a new pixel in old pixels, at least 1. Rests at the right and lower border that fill no
+                whole pixel are cut off.
 
         Raises:
-            ValueError: No whole pixel is left; a sentence that can follow "FILE holds".
+            ValueError: No whole pixel remains. The message can follow "FILE holds".
         """
         assert self.model == "pinhole"
         cx, cy = ((centre + 0.5) / factor - 0.5 for centre in (self.cx, self.cy))
@@ -246,9 +246,9 @@ class Camera:
 
     @cached_property
     def _seen_by(self) -> Float32[np.ndarray, "height width 2"]:
-        """For a lookup camera, the place in its image that each pixel of the undistorted image shows.
+        """For a lookup camera, the place in the distorted image of each pixel of the undistorted image.
 
-        The table maps places to undistorted places; it is inverted by fixed-point iteration from no distortion on.
+        The table maps distorted places to undistorted places. A fixed-point iteration inverts it.
         """
         assert self.directions is not None
         table = (self.directions * [self.fx, self.fy] + [self.cx, self.cy]).astype(np.float32)
@@ -262,10 +262,10 @@ class Camera:
 
 
 def check_rotation(matrix: Float64[np.ndarray, "3 3"]) -> None:
-    """Whether a matrix turns without stretching or mirroring.
+    """Checks that a matrix is a rotation.
 
     Raises:
-        ValueError: It does not, by more than 1e-3.
+        ValueError: The matrix stretches or mirrors by more than 1e-3.
     """
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     determinant = float(np.linalg.det(matrix))

@@ -1,7 +1,7 @@
-"""What goes wrong by no fault of the program: an input, a flag, or the place where results are to go.
+"""Errors that the user can correct: in an input, in a flag, or at the place of results.
 
 Every message is one sentence: which file or flag, what was found, what was expected, what to do. The command line shows
-it alone, without a traceback.
+only this sentence, without a traceback.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 
 
 class UserError(Exception):
-    """Something that the user can mend."""
+    """An error that the user can correct."""
 
 
 class RecordingError(UserError, ValueError):
-    """Input that cannot be used: a recording, a scene, a video, a trained run."""
+    """An input that cannot be used: a recording, a scene, a video, a trained run."""
 
 
 class FlagError(UserError, ValueError):
@@ -27,17 +27,16 @@ class FlagError(UserError, ValueError):
 
 
 class OutputError(UserError):
-    """Results cannot be written: the disk is full, or the place exists already or must not be written to."""
+    """Results that cannot be written: the disk is full, or the place exists already or is protected."""
 
 
 @contextmanager
 def exit_with_a_sentence() -> Iterator[None]:
-    """Ends the program, where the block ends with something that the user can mend, with a sentence that says it.
+    """Ends the program with one sentence if the block raises an error that the user can correct.
 
     Raises:
-        SystemExit: In place of a `UserError`, of an OSError by which the system refuses a file or a folder, and of an
-            error about a name that cannot be written as text. Its sentence is on one line, whatever a name in it holds.
-            In place of a KeyboardInterrupt, with code 130.
+        SystemExit: Replaces a `UserError`, an OSError about a file or folder, and an error about a name that is not
+            text. The sentence is on one line, whatever a name in it holds. Replaces a KeyboardInterrupt, with code 130.
     """
     try:
         yield
@@ -59,7 +58,7 @@ def exit_with_a_sentence() -> Iterator[None]:
 
 
 def quoted(path: Path) -> str:
-    """A path as bash takes it for one word, on one line."""
+    """Returns a path on one line, quoted as one word for bash."""
     text = str(path)
     if text.isprintable():
         return shlex.quote(text)
@@ -71,7 +70,7 @@ def quoted(path: Path) -> str:
 
 
 def printable(text: str) -> str:
-    """A text on one line, in which whatever ends lines, moves a terminal's cursor or is no UTF-8 is escaped."""
+    """Returns a text on one line, with line ends, control characters and invalid UTF-8 escaped."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode() for letter in text
     )

@@ -13,16 +13,16 @@ from enerf_ns.dataparsers.recording.files import partial_of
 
 
 def make_ffmpeg_available() -> None:
-    """Lets this process, and those it starts, find a program named `ffmpeg`.
+    """Makes a program named `ffmpeg` available to this process and its children.
 
-    Where there is none on the `PATH`, a link (on Windows a copy) to the binary of imageio-ffmpeg is put into the cache
-    folder of the user, and that folder is appended to the `PATH`. Where that is impossible, nothing changes.
+    If the `PATH` has none, this function puts a link (on Windows a copy) to the binary of imageio-ffmpeg into the
+    user's cache folder, and appends this folder to the `PATH`. If that is impossible, nothing changes.
     """
     if shutil.which("ffmpeg") is not None:
         return
     try:
         folder = user_cache_path("enerf-ns", appauthor=False) / "bin"
-        if not folder.is_absolute():  # as of a home folder that is not known
+        if not folder.is_absolute():  # if the home folder is not known
             return
         if shutil.which("ffmpeg", path=str(folder)) is None:
             _link_ffmpeg_into(folder)

@@ -1,4 +1,4 @@
-"""Files that recordings are made of: images, arrays, JSON; and files that are written whole or not at all."""
+"""Reads images, arrays and JSON, and writes files completely or not at all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
@@ -22,10 +22,10 @@ from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, Use
 
 
 def expanded(path: Path | str) -> Path:
-    """A path that a user gave, with the home folder that ~ stands for.
+    """Returns a path that a user gave, with the home folder in place of ~.
 
     Raises:
-        FlagError: That folder is unknown, or the path is not UTF-8, of which some libraries take no other.
+        FlagError: The home folder is unknown, or the path is not UTF-8, which some libraries require.
     """
     try:
         expanded = Path(path).expanduser()
@@ -39,26 +39,26 @@ def expanded(path: Path | str) -> Path:
 
 
 def absolute(path: Path | str) -> Path:
-    """A path that a user gave, with ~ for a home folder, as an absolute one without links.
+    """Returns a path that a user gave, perhaps with ~, as an absolute path without links.
 
     Raises:
         FlagError: The home folder is unknown, the path is not UTF-8, or links lead in a circle.
     """
     try:
         return expanded(expanded(path).resolve())
-    except (OSError, RuntimeError) as error:  # of which Python has raised either, depending on its version
+    except (OSError, RuntimeError) as error:  # which one depends on the version of Python
         raise FlagError(f"{path} cannot be followed (links that lead in a circle); give another path.") from error
 
 
 @contextmanager
 def of_file(path: Path | str) -> Iterator[None]:
-    """Says of a value that does not check itself as sound which file it came from.
+    """Turns a ValueError of the block into an error that names the file.
 
     Args:
-        path: The file or the folder; in words, a part of one, such as "camchain.yaml, cam0,".
+        path: The file or folder, or words for a part of it, such as "camchain.yaml, cam0,".
 
     Raises:
-        RecordingError: `path holds`, and what the ValueError of the block says.
+        RecordingError: The words "PATH holds" and the message of the ValueError.
     """
     try:
         yield
@@ -69,11 +69,11 @@ def of_file(path: Path | str) -> Iterator[None]:
 
 
 def check_is_file(path: Path, expected: str) -> None:
-    """Says so where something is there that is no file: whoever opens a pipe or a device may wait for ever.
+    """Checks that a path is a regular file or missing. Opening a pipe or a device could wait for ever.
 
     Args:
-        path: Links are followed.
-        expected: What is expected there, such as "an HDF5 file with events".
+        path: The path; links are followed.
+        expected: The expected content, such as "an HDF5 file with events".
 
     Raises:
         RecordingError: A folder, pipe, device or socket.
@@ -84,11 +84,11 @@ def check_is_file(path: Path, expected: str) -> None:
 
 
 def check_is_folder(path: Path, expected: str) -> None:
-    """Says so where something is there that is no folder, in which nothing would be found.
+    """Checks that a path is a folder or missing.
 
     Args:
-        path: Links are followed.
-        expected: What is expected there, such as "a folder of frames".
+        path: The path; links are followed.
+        expected: The expected content, such as "a folder of frames".
 
     Raises:
         RecordingError: A file of any kind.
@@ -99,24 +99,25 @@ def check_is_folder(path: Path, expected: str) -> None:
 
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
-    """Turns whatever a library raises at a damaged file into one sentence about it.
+    """Turns any error of a library about a damaged file into one sentence.
 
     Args:
         path: The file.
-        expected: What it is to hold, such as "an HDF5 file with events".
+        expected: The expected content, such as "an HDF5 file with events".
 
     Raises:
-        RecordingError: Anything went wrong, or no file is there.
+        RecordingError: The block raised an error, or the file is missing.
     """
     try:
         check_is_file(path, expected)
         yield
     except UserError:
         raise
-    except Exception as error:  # of any kind, since libraries have their own for what is damaged
+    except Exception as error:  # libraries raise errors of many types at damaged files
         _check_can_be_read(path, expected)
-        told = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)  # which would be quoted
-        lines = told.strip().splitlines() or [type(error).__name__]
+        is_key = isinstance(error, KeyError) and bool(error.args)  # str would quote the key
+        text = str(error.args[0] if is_key else error)
+        lines = text.strip().splitlines() or [type(error).__name__]
         reason = lines[0].rstrip(".").replace(". ", ", ")
         raise RecordingError(
             f"{path} cannot be read as {expected} ({reason}); copy it again from its source."
@@ -124,7 +125,7 @@ def reading(path: Path, expected: str) -> Iterator[None]:
 
 
 def _check_can_be_read(path: Path, expected: str) -> None:
-    """Raises a RecordingError where nothing, or nothing but an empty file, or one that is not to be read, is there."""
+    """Raises RecordingError if the file is missing, empty or not readable."""
     try:
         with open(path, "rb") as file:
             is_empty = not file.read(1)
@@ -139,28 +140,27 @@ def _check_can_be_read(path: Path, expected: str) -> None:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The text of a file, UTF-8 with or without a byte-order mark.
+    """Returns the text of a file, UTF-8 with or without a byte-order mark.
 
     Args:
         path: The file.
-        expected: What it is to hold, such as "JSON".
+        expected: The expected content, such as "JSON".
 
     Raises:
-        RecordingError: The file is missing, cannot be read, or is no text.
+        RecordingError: The file is missing, cannot be read, or is not text.
     """
     with reading(path, expected):
         return path.read_text(encoding="utf-8-sig")
 
 
 def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
-    """An image file with one or three channels and the values that it holds: uint8, uint16 or float32.
+    """Returns the stored values of an image with one or three channels: uint8, uint16 or float32.
 
-    What is transparent is laid over white. What 16 bits and floats are of full brightness, the file does not say; see
-    `picture_depth`.
+    Transparent pixels are laid over white. For 16 bits and floats, `picture_depth` finds the value of full brightness.
 
     Raises:
-        RecordingError: The file is missing or cannot be decoded, or holds other values, or floats that are below 0 or
-            no numbers.
+        RecordingError: The file is missing or cannot be decoded, or holds values of another type, below 0 or not
+            finite.
     """
     with reading(path, "an image"):
         if is_deep(path):
@@ -177,7 +177,7 @@ def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
 
 
 def is_deep(path: Path) -> bool:
-    """Whether an image has more than 8 bits a channel, from the header only.
+    """Returns whether an image has more than 8 bits in each channel, from the header only.
 
     Raises:
         RecordingError: The file is missing.
@@ -194,7 +194,7 @@ def is_deep(path: Path) -> bool:
 
 
 def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
-    """An image of more than 8 bits a channel, uint16 or float32; in the words of `load_image`."""
+    """Returns the values of an image with more than 8 bits in each channel, uint16 or float32, as `load_image` does."""
     with suppress(UnidentifiedImageError), Image.open(path) as image:
         image.verify()
     stored = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -222,28 +222,30 @@ def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
 
 
 def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
-    """An image with three channels, equal ones where it is grey: [height, width], or with one channel."""
+    """Returns an image with three channels; a grey image, [height, width] or with one channel, is repeated."""
     image = image if image.ndim == 3 else image[..., None]
     return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
 
-def check_image_size(path: Path, width: int, height: int) -> None:
-    """Reads an image's header only.
+def check_image_sizes(paths: Sequence[Path], width: int, height: int) -> None:
+    """Checks that images have this size in pixels, from their headers only.
 
     Raises:
-        RecordingError: The file is missing, no image, or not of the size in pixels.
+        RecordingError: A file is missing, is not an image, or has another size.
     """
-    if (found := image_size(path)) != (width, height):
-        raise RecordingError(
-            f"{path} has {found[0]} x {found[1]} pixels, but {width} x {height} as of the sensor were expected."
-        )
+    for path in paths:
+        if (found := image_size(path)) != (width, height):
+            raise RecordingError(
+                f"{path} has {found[0]} x {found[1]} pixels, but {width} x {height} of its camera were expected; give "
+                "images and calibration of one resolution."
+            )
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the header only.
+    """Returns width and height in pixels, from the header only.
 
     Raises:
-        RecordingError: The file is missing or no image.
+        RecordingError: The file is missing or is not an image.
     """
     with reading(path, "an image"):
         try:
@@ -255,11 +257,11 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, "..."]:
-    """An array of real numbers from a .npy file.
+    """Returns an array of real numbers from a .npy file.
 
     Args:
         path: The file.
-        mmap_mode: As of `numpy.load`; "r" to read the header only.
+        mmap_mode: The argument of `numpy.load`; "r" reads only the header.
 
     Raises:
         RecordingError: The file is missing, or holds no such array.
@@ -272,7 +274,7 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file, with or without a byte-order mark.
+    """Returns the JSON object of a file, with or without a byte-order mark.
 
     Raises:
         RecordingError: The file is missing or holds no JSON object.
@@ -285,7 +287,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def fill_page(template: Path, **values: Any) -> str:
-    """A page of HTML from a Jinja template, in which values are escaped and a missing one is an error."""
+    """Returns a page of HTML from a Jinja template. Values are escaped, and a missing value is an error."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     templates = Environment(
@@ -299,20 +301,21 @@ def fill_page(template: Path, **values: Any) -> str:
 
 
 def partial_of(path: Path) -> Path:
-    """A path beside another, for what becomes that one once it is whole. What processes of this machine that are gone
-    have left of such in the same folder is removed.
+    """Returns the path of a temporary file or folder, which replaces `path` once it is complete.
+
+    The function also removes temporary files that ended processes of this machine left in the same folder.
 
     Args:
-        path: Of a file or folder; the name of the partial has the same suffix.
+        path: The final path; the temporary name has the same suffix.
     """
     remove_leftovers(path.parent)
     return path.with_name(f".{path.stem}{_mark()}{os.getpid()}{path.suffix}")
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes from a folder the partials (`partial_of`) of processes of this machine that are gone."""
+    """Removes the temporary files (`partial_of`) that ended processes of this machine left in a folder."""
     mark = _mark()
-    with suppress(OSError):  # no folder yet, or none that may be looked into
+    with suppress(OSError):  # the folder is missing or may not be read
         for entry in os.scandir(folder):
             number = entry.name.rpartition(mark)[2].partition(".")[0] if entry.name.startswith(".") else ""
             if mark in entry.name and number.isdecimal() and not psutil.pid_exists(int(number)):
@@ -323,34 +326,34 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _mark() -> str:
-    """What the names of partials hold before the number of their process."""
+    """Returns the part of a temporary name before the number of its process."""
     return f".partial-{platform.node()}-"
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Writes a file so that it is whole or not there, or as it was before.
+    """Writes a file completely, or leaves everything as it was.
 
     Args:
-        path: Its folder is made where it does not exist.
-        content: Text is encoded as UTF-8.
+        path: The file; its folder is created if it is missing.
+        content: Bytes, or text that is encoded as UTF-8.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+        OSError: The disk is full, or the folder cannot be written to.
     """
     write_together(path.parent, {path.name: content.encode() if isinstance(content, str) else content})
 
 
 def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] | None = None) -> None:
-    """Writes files and appends lines to tables, all or, if anything fails, none.
+    """Writes files and appends lines to tables: all of them, or none after an error.
 
     Args:
-        folder: That the paths begin at, and in which the partials lie.
-        files: What each file shall hold, by path; one that is there already is replaced.
-        lines: What is appended to each table of text, by path.
+        folder: The start of all paths, and the place of temporary files.
+        files: Content of each file by path; existing files are replaced.
+        lines: Text that is appended to each table, by path.
 
     Raises:
-        OSError: The disk is full, or a folder cannot be written to; all is as it was before then, except that of
-            several files that are replaced some may be the new ones.
+        OSError: The disk is full, or a folder cannot be written to. Everything is then as before, except that some of
+            several replaced files may be new.
     """
     lines = lines or {}
     partials = {path: partial_of(folder / path.replace("/", "-")) for path in files}
@@ -376,10 +379,10 @@ def write_together(folder: Path, files: dict[str, bytes], lines: dict[str, str] 
 
 
 def write_all(file: FileIO, content: bytes) -> None:
-    """Writes to an unbuffered file, which may take less than it is given when the disk is nearly full.
+    """Writes all bytes to an unbuffered file, whose `write` may accept only a part when the disk is nearly full.
 
     Raises:
-        OSError: The disk is full; a part may be written.
+        OSError: The disk is full. A part may be written.
     """
     left = memoryview(content)
     while left:

@@ -1,8 +1,8 @@
-"""What full brightness is in pictures of more than 8 bits, and pictures as brightness.
+"""Finds the value of full brightness in images of more than 8 bits, and converts images to brightness.
 
-A picture is uint8, of which 255 is full brightness, or float32 in [0, 1]; 8 bits stay as they are, since they need a
-quarter of the memory. Cameras of 10, 12 or 14 bits write files of 16 bits, whose largest value over the recording tells
-which of these it was. Picture by picture, brightness would jump from one to the next.
+An image is uint8, with 255 as full brightness, or float32 in [0, 1]. Images of 8 bits stay uint8, which needs a quarter
+of the memory. Cameras of 10, 12 or 14 bits write files of 16 bits. The largest value over the whole recording shows the
+number of bits. A value for each image would make the brightness jump from image to image.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import is_deep, load_image
 
 DEPTHS = (8, 10, 12, 14, 16)
-"""Bits of a pixel that are told apart in files of 16."""
+"""Numbers of bits that a camera may have."""
 
 
 @lru_cache(maxsize=16)
 def find_white_level(files: tuple[Path, ...]) -> float:
-    """The value of full brightness in pictures of one recording that have more than 8 bits; 255 where there are none.
+    """Returns the value of full brightness in the images of one recording with more than 8 bits.
 
-    Of whole numbers, the largest one of the fewest bits of `DEPTHS` that all values fit into, or what the header of a
-    file states. Of floats 1, or the largest value where that is above 1.
+    For integers, it is the largest number of the fewest bits of `DEPTHS` that hold all values, or the number that the
+    header of a file states. For floats, it is 1, or the largest value if that is above 1. Without such images it is
+    255.
 
     Args:
-        files: Of the recording; those of 8 bits are passed over.
+        files: All images of the recording; images of 8 bits are ignored.
 
     Raises:
-        RecordingError: A file is missing or cannot be decoded, or some hold whole numbers and others floats.
+        RecordingError: A file is missing or cannot be decoded, or some files hold integers and others floats.
     """
     largest, stated, kind = 0.0, 0.0, None
     deep = [file for file in files if is_deep(file)]
@@ -58,20 +59,19 @@ def find_white_level(files: tuple[Path, ...]) -> float:
 
 
 def brightness(picture: Shaped[np.ndarray, "height width channels"]) -> Float32[np.ndarray, "height width channels"]:
-    """A picture in [0, 1]."""
+    """Returns an image in [0, 1]."""
     return picture / np.float32(255) if picture.dtype == np.uint8 else picture
 
 
 def in_8_bits(picture: Shaped[np.ndarray, "height width channels"]) -> UInt8[np.ndarray, "height width channels"]:
-    """A picture as any program can show it."""
+    """Returns an image with 8 bits in each channel."""
     return picture if picture.dtype == np.uint8 else np.rint(255 * picture).astype(np.uint8)
 
 
 def _stated_white(file: Path) -> int:
-    """The largest value that the header of a file with 16 bits states; 0 where it states none.
+    """Returns the largest value that the header of a file with 16 bits states, or 0.
 
-    That of PGM and PPM, of TIFF with 10, 12 or 14 bits, which OpenCV moves to the upper end of 16, and of PNG with a
-    chunk sBIT.
+    PGM and PPM state it, TIFF with 10, 12 or 14 bits (which OpenCV shifts to the upper bits), and PNG with sBIT.
     """
     content = file.read_bytes()
     if content[:2] in (b"P5", b"P6"):

@@ -1,4 +1,4 @@
-"""White noise of poses: how large it is, and the trajectory without most of it."""
+"""Estimates white noise of poses, and smooths trajectories."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from scipy.interpolate import make_smoothing_spline
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FEWEST_POSES = 20
-"""Fewest poses from which noise can be told."""
+"""Least number of poses for an estimate of the noise."""
 
 MOST_POSES = 200_000
-"""Most poses that are smoothed: of more, as of an inertial sensor's rate, the noise is that of a filter."""
+"""Largest number of poses that are smoothed. More poses, as at the rate of an inertial sensor, have filtered noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,31 +22,30 @@ class PoseNoise:
     """Noise that is independent from pose to pose."""
 
     position: float
-    """Standard deviation along an axis, metres; of what was told from motion, which is less than all."""
+    """Standard deviation along an axis, metres. It is a lower bound, since part of the noise looks like motion."""
     rotation: float
     """Standard deviation about an axis, radians."""
     smooth: Trajectory
-    """The trajectory without what could be told of it."""
+    """The trajectory without the estimated noise."""
 
     def pixels(self, focal_length: float, depth: float) -> float:
-        """By how much it moves the picture, pixels: standard deviation along an axis.
+        """Returns the standard deviation of the shift of the image along an axis, pixels.
 
         Args:
             focal_length: Pixels.
-            depth: Usual depth of the scene, metres.
+            depth: Typical depth of the scene, metres.
         """
         return float(focal_length * np.hypot(self.position / depth, self.rotation))
 
 
 def pose_noise(given: Trajectory) -> PoseNoise | None:
-    """What of a trajectory is noise, and the rest.
+    """Returns the noise of a trajectory, and the smooth trajectory.
 
-    Positions and quaternions are smoothed by cubic smoothing splines, whose smoothness cross-validation chooses (Craven
-    and Wahba, Numerische Mathematik 1979; SciPy's `make_smoothing_spline`): where neighbouring poses predict a pose
-    better than it does itself.
+    Positions and quaternions are smoothed by cubic smoothing splines, whose smoothness is chosen by generalised
+    cross-validation (Craven and Wahba, Numerische Mathematik 1979; SciPy's `make_smoothing_spline`).
 
     Returns:
-        None where there are too few poses, or too many.
+        None if there are fewer than `FEWEST_POSES` or more than `MOST_POSES` poses.
     """
     times = given.times
     if not FEWEST_POSES <= len(times) <= MOST_POSES:
@@ -68,7 +67,7 @@ def pose_noise(given: Trajectory) -> PoseNoise | None:
 def _smoothed(
     times: Int64[np.ndarray, " poses"], values: Float64[np.ndarray, "poses columns"]
 ) -> tuple[Float64[np.ndarray, "poses columns"], float]:
-    """Columns without their noise, and the standard deviation of what was taken off."""
+    """Returns smooth columns, and the standard deviation of the noise that was removed."""
     seconds = 1e-9 * (times - times[0])
     places = seconds / np.median(np.diff(seconds))  # so that the smoothness is of the order of 1
     found, taken = np.empty_like(values), 0.0

@@ -1,6 +1,6 @@
-"""A recording of an event camera, whatever format it was read from: events, frames, cameras and poses on one clock.
+"""A recording of an event camera in any format: events, frames, cameras and poses on one clock.
 
-These are values, checked where they are made; `enerf_ns.dataparsers.formats.registry` reads them from folders.
+The constructors check the values. `enerf_ns.dataparsers.formats.registry` reads recordings from folders.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from enerf_ns.dataparsers.recording.pose_noise import pose_noise
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
-"""Events that readers hand on at once: enough for speed, few enough to need hardly any memory."""
+"""Number of events that a reader yields at once: enough for speed, with little memory."""
 
 LARGEST_SPAN_RATIO = 300
-"""Largest ratio between the spans of events or frames and poses; units of time differ by 1000."""
+"""Largest ratio between the time spans of events or frames and of poses. Units of time differ by 1000."""
 
 LONGEST_REFRACTORY_PERIOD = 10**12
 """Longest refractory period, nanoseconds."""
 
 CONTRAST_THRESHOLD_LIMITS = (1e-3, 10.0)
-"""Least and largest contrast threshold, change of log brightness. Sensors have more than ten times the least, below
-which events beyond number would follow; the largest is a change of brightness by e^10, 22,000 times."""
+"""Least and largest contrast threshold, change of log brightness. Sensors have more than ten times the least. The
+largest is a change of brightness by e^10, which is 22,000."""
 
 DEPTH_LIMITS = (1e-6, 1e9)
 """Least and largest depth, metres."""
 
 EXPOSURE_OVERLAP = 1.1
-"""Largest ratio between exposures and the time from frame to frame; stamps jitter."""
+"""Largest ratio of an exposure to the time between frames. It is above 1, since stamps jitter."""
 
 LONGEST_EXPOSURE = 10**15
-"""Exposure, nanoseconds, beyond which all are too long alike."""
+"""Limit to which longer exposures are clipped, nanoseconds. All such exposures are refused."""
 
 SHORTEST_EXPOSURE = 1_000
-"""Shortest exposure, nanoseconds, but for 0; shorter ones are in another unit."""
+"""Shortest exposure above 0, nanoseconds. Shorter ones are in another unit."""
 
 SHORTEST_FRAME_STEP = 1_000_000
-"""Shortest time from frame to frame, nanoseconds; frames closer together than this are in another unit if they also
-span hardly any of the poses."""
+"""Shortest time between frames, nanoseconds. Closer frames are in another unit if they also span a small part of the
+poses."""
 
 
 @dataclass(frozen=True)
 class Events:
-    """Brightness changes in time order, one array a column."""
+    """Events in time order, one array for each column."""
 
     x: Int[np.ndarray, " events"]
     """Columns of the pixels, of any integer type."""
@@ -62,7 +62,7 @@ class Events:
     t: Int64[np.ndarray, " events"]
     """Times in nanoseconds, never decreasing."""
     p: Int[np.ndarray, " events"]
-    """Polarities: 1 where it became brighter; where it became darker, -1, or 0 or false as some formats write."""
+    """Polarities: 1 for brighter; -1, 0 or false for darker."""
 
     def __len__(self) -> int:
         return len(self.t)
@@ -70,10 +70,10 @@ class Events:
 
 @dataclass(frozen=True)
 class Frames:
-    """Pictures, one file each, with the camera that took them.
+    """Frames, one file each, with their camera.
 
     Raises:
-        ValueError: The exposures are not as their field says; a sentence that can follow "FILE holds".
+        ValueError: The exposures are out of range. The message can follow "FILE holds".
     """
 
     filenames: tuple[Path, ...]
@@ -86,16 +86,16 @@ class Frames:
     """Depth maps, .npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was
     hit."""
     exposures: Int64[np.ndarray, " frames"] | None = None
-    """How long each was exposed, ns: 0 for an instant, else from `SHORTEST_EXPOSURE` to the time from frame to frame.
-    None where that is not known. A frame is the mean of what its camera saw meanwhile."""
+    """Exposure of each frame, ns: 0, or from `SHORTEST_EXPOSURE` to the time between frames. None if it is not known. A
+    frame is the mean brightness during its exposure."""
     numbers: Int64[np.ndarray, " frames"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Number of each frame in its folder, from 0; counted here unless given."""
+    """Number of each frame in its folder, from 0. Default: 0, 1, 2 and so on."""
     downscale_factor: float = 1.0
-    """Pixels along the squares of which each becomes one pixel of a picture, at least 1."""
+    """Width of a downscaled pixel in pixels of the frame, at least 1."""
     stated_white: float | None = None
-    """The value of full brightness in files of more than 8 bits, where the recording states it."""
+    """The value of full brightness in files of more than 8 bits; None if the recording does not state it."""
     files_of_recording: tuple[Path, ...] = ()
-    """All frames of the recording, which tell that value where it is not stated; `filenames` unless given."""
+    """All frames of the recording, from which that value is found if it is not stated. Default: `filenames`."""
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -105,7 +105,7 @@ class Frames:
 
     @property
     def exposed(self) -> Int64[np.ndarray, "frames 2"]:
-        """First and last instant (ns) of each exposure; twice the time of the frame where it is not known."""
+        """First and last instant (ns) of each exposure. Both are the frame's time if the exposure is not known."""
         exposures = np.zeros_like(self.times) if self.exposures is None else self.exposures
         opens = self.times - exposures // 2
         return np.stack([opens, opens + exposures], axis=1)
@@ -127,14 +127,14 @@ class Frames:
 
     @property
     def white_in_words(self) -> str:
-        """What is taken as full brightness, to follow other words on the frames; empty for frames of 8 bits."""
+        """Words that state the value of full brightness; empty for frames of 8 bits."""
         return f", white is {self.white_level:g}" if is_deep(self.filenames[0]) else ""
 
     def image(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
-        """A frame as its camera took it, with one or three channels: uint8, or float32 in [0, 1] of deeper files.
+        """Returns a frame with one or three channels: uint8, or float32 in [0, 1] for files of more bits.
 
         Raises:
-            RecordingError: The file is missing or cannot be decoded, or holds more than what is stated to be white.
+            RecordingError: The file is missing or cannot be decoded, or holds a value above the stated full brightness.
         """
         image = load_image(self.filenames[index])
         if image.dtype == np.uint8:
@@ -147,17 +147,13 @@ class Frames:
         return image / np.float32(self.white_level)
 
     def picture(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
-        """A frame as the `picture_camera` would have taken it; of the types of `image`.
-
-        Raises:
-            RecordingError: As of `image`.
-        """
+        """Returns a frame as the `picture_camera` sees it, of the same type as `image`; raises what `image` raises."""
         return self.downscaled(self.camera.undistort(self.image(index)))
 
     def downscaled(
         self, image: Shaped[np.ndarray, "height width channels"]
     ) -> Shaped[np.ndarray, "new_height new_width channels"]:
-        """An image of the size of the frames at that of the pictures, antialiased; uint8, or float32."""
+        """Returns an image of the frames' size at the size of the `picture_camera`, antialiased; uint8 or float32."""
         if self.downscale_factor == 1.0:
             return image
         camera = self.picture_camera
@@ -169,7 +165,7 @@ class Frames:
         return np.dstack(small)
 
     def depth(self, index: int) -> Float32[np.ndarray, "height width"] | None:
-        """Depth along the optical axis in metres, 0 where it is unknown; of the middles of downscaled pixels.
+        """Returns depth along the optical axis in metres at the middles of downscaled pixels, 0 where it is unknown.
 
         Raises:
             RecordingError: The file is missing or holds no array.
@@ -184,12 +180,12 @@ class Frames:
         return depth[np.ix_(rows, columns)]
 
     def with_exposure(self, exposure: int | None) -> Frames:
-        """The frames, all exposed for as long (ns), or for an unknown time."""
+        """Returns the frames with the same exposure (ns) for all; None for an unknown exposure."""
         exposures = None if exposure is None else np.full(len(self.times), min(exposure, LONGEST_EXPOSURE))
         return replace(self, exposures=exposures)
 
     def subset(self, indices: Int[np.ndarray, " chosen"]) -> Frames:
-        """The frames at the given indices only."""
+        """Returns the frames at the given indices."""
         depth = self.depth_filenames and tuple(self.depth_filenames[i] for i in indices)
         return replace(
             self,
@@ -204,12 +200,14 @@ class Frames:
 
 @dataclass(frozen=True, eq=False)
 class EventRecording:
-    """What a reader found in a folder. Frames outside the poses are dropped at once, events when they are indexed.
+    """A recording as a reader returns it.
+
+    The constructor drops frames outside the poses. The index of the events drops events outside the poses.
 
     Raises:
-        RecordingError: The frames and the poses span times that do not fit together.
-        ValueError: A threshold, the refractory period, the colour filter, the response or the range of depth is not as
-            its field says; a sentence that can follow "FILE holds".
+        RecordingError: The time spans of frames and poses do not fit together.
+        ValueError: A threshold, the refractory period, the Bayer pattern, the response or the depth range is invalid.
+            The message can follow "FILE holds".
     """
 
     path: Path
@@ -220,59 +218,58 @@ class EventRecording:
     trajectory: Trajectory
     """Trajectory of the event camera."""
     stream_events: Callable[[], Iterator[Events]]
-    """Reads the events as they are in the files, in pieces of at most about `EVENTS_AT_A_TIME`. Every call starts again
-    and gives the same events, whatever a file has grown by since the reader looked at it."""
+    """Function that yields the events as they are in the files, in pieces of about `EVENTS_AT_A_TIME`. All calls yield
+    the same events, even if a file has grown since the reader opened it."""
     event_files: tuple[Path, ...]
-    """All files that the events come from."""
+    """All files of the events."""
     frames: Frames | None = None
     """Sharp frames."""
     blurred_frames: Frames | None = None
-    """Frames at the same instants as the sharp ones, blurred by motion, or reconstructed from events."""
+    """Frames that are blurred by motion or reconstructed from events."""
     reconstructed_by: str | None = None
-    """What reconstructed the blurred frames from events; None where a camera took them."""
+    """Name of the method that reconstructed the blurred frames from events; None if a camera took them."""
     held_out_frames: Frames | None = None
-    """Views for evaluation alone, on a trajectory and a clock of their own."""
+    """Views only for evaluation, with their own trajectory and clock."""
     contrast_thresholds: tuple[float, float] | None = None
-    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`, where the recording knows
-    them."""
+    """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`; None if they are not known."""
     refractory_period: int = 0
-    """For how long a pixel is blind after an event, ns; at most 1000 s."""
+    """Refractory period of a pixel after an event, ns; at most 1000 s."""
     bayer_pattern: str | None = None
-    """Colours of the sensor's pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; None: a grey sensor."""
+    """Colours of the pixels (x, y) = (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; None for a grey sensor."""
     response: str | None = None
-    """How the sensor answers brightness, in the words of `enerf_ns.sensor.response`: linlog, or logarithm:OFFSET; None
-    where the recording does not state it."""
+    """Response of the sensor to brightness, as in `enerf_ns.sensor.response`: linlog, or logarithm:OFFSET; None if the
+    recording does not state it."""
     depth_range: tuple[float, float] | None = None
-    """Nearest and farthest depth in metres, within `DEPTH_LIMITS`, where the recording knows them."""
+    """Nearest and farthest depth in metres, within `DEPTH_LIMITS`; None if they are not known."""
     notes: tuple[str, ...] = ()
-    """What was dropped or renormalised, one sentence each; what is said of the events is with their index."""
+    """Sentences on what was dropped or renormalised. The index has such sentences on events."""
     shares_outside_poses: dict[str, float] = field(default_factory=dict)
-    """Share that is left out of "frames" and of "blurred frames" for lack of poses, where it is above 0."""
+    """Share of "frames" and of "blurred frames" outside the poses, which are left out, if it is above 0."""
     locate_event: Callable[[int], str] | None = None
-    """File and line of event number i of the stream, for error messages."""
+    """Function that returns the file and line of event number i of the stream, for error messages."""
     num_events: int | None = None
-    """Number of events in the files, where that is known before they are read; for progress alone."""
+    """Number of events in the files, only to show progress; None if it is not known before reading."""
     time_range: tuple[int, int] | None = None
-    """First and last time (ns) of what is used of the recording."""
+    """First and last time (ns) of the selected range; None for the whole recording."""
     keep_hot_pixels: bool = False
     """Whether pixels that fire far more often than their neighbourhood are used."""
     keep_pose_gaps: bool = False
     """Whether instants within the gaps of the trajectory are used."""
     as_read: EventRecording | None = None
-    """The recording as it was read, of one whose poses or camera were refined: the events are the same."""
+    """The original recording if the poses or the camera of this one were refined. The events are the same."""
     pose_noise_taken_off: tuple[float, float] | None = None
-    """Standard deviations along and about an axis, metres and radians, of the noise that was taken off the poses. None:
-    they were not smoothed."""
+    """Standard deviations of the noise removed from the poses, along an axis (metres) and about it (radians); None if
+    the poses were not smoothed."""
     event_file_states: tuple[tuple[str, int, int, int], ...] = ()
-    """Path, size in bytes, and times of modification and of change (ns) of each of `event_files` when they were looked
-    at; taken here unless given."""
+    """Path, size in bytes, and times of modification and of change (ns) of each of `event_files`. Default: their state
+    now."""
 
     def __post_init__(self) -> None:
         self._check_what_is_stated()
         if not self.event_file_states:
             states = [(file.resolve(), file.stat()) for file in self.event_files]
-            told = ((str(path), now.st_size, now.st_mtime_ns, now.st_ctime_ns) for path, now in states)
-            self._set(event_file_states=tuple(told))
+            found = ((str(path), now.st_size, now.st_mtime_ns, now.st_ctime_ns) for path, now in states)
+            self._set(event_file_states=tuple(found))
         self._set_files_of_recording()
         notes, shares = [*self.notes], dict(self.shares_outside_poses)
         covered = {
@@ -289,17 +286,17 @@ class EventRecording:
         undistort: bool = True,
         smooth_poses: bool = False,
     ) -> EventRecording:
-        """The recording of which a part of the events is used; for one selection always the same object.
+        """Returns the recording with these selections; the same selections return the same object.
 
         Args:
             time_range: First and last time in seconds on the recording's clock, or None for all.
             keep_hot_pixels: Use pixels that fire far more often than their neighbourhood.
             keep_pose_gaps: Use instants within the gaps of the trajectory.
-            undistort: Believe the distortion of the cameras; otherwise they have none.
-            smooth_poses: Take the noise off the poses (`pose_noise`).
+            undistort: Use the distortion of the cameras; otherwise they have none.
+            smooth_poses: Remove the noise from the poses (`pose_noise`).
 
         Raises:
-            FlagError: The range holds no poses, or lies within a gap that is left out.
+            FlagError: The time range holds no poses, or lies within a gap that is left out.
         """
         range_ns = time_range and (nanoseconds(time_range[0]), nanoseconds(time_range[1]))
         selection = self
@@ -326,34 +323,34 @@ class EventRecording:
 
     @property
     def span(self) -> tuple[int, int]:
-        """First and last time (ns) that is used: of the poses, within the range that was selected."""
+        """First and last time (ns) that is used: the poses within the selected range."""
         start, end = self.time_range or (self.trajectory.start, self.trajectory.end)
         return max(start, self.trajectory.start), min(end, self.trajectory.end)
 
     @property
     def pose_gaps(self) -> Int64[np.ndarray, "gaps 2"]:
-        """Those of `Trajectory.gaps` that reach into the span, whether they are kept or not."""
+        """The `Trajectory.gaps` that overlap the span, whether they are kept or not."""
         (start, end), gaps = self.span, self.trajectory.gaps
         return gaps[(gaps[:, 0] < end) & (gaps[:, 1] > start)]
 
     @property
     def stretches(self) -> Int64[np.ndarray, "stretches 2"]:
-        """First and last instant (ns) of each part of the span that is used: all, or what lies between the gaps."""
+        """First and last instant (ns) of each used part of the span: the whole span, or the parts between gaps."""
         start, end = self.span
         gaps = self.pose_gaps[: 0 if self.keep_pose_gaps else None]
         stretches = np.concatenate([[start], gaps.flatten(), [end]]).reshape(-1, 2)
         return stretches[stretches[:, 0] <= stretches[:, 1]]
 
     def instants(self, number: int) -> Int64[np.ndarray, " number"]:
-        """Instants (ns) spread evenly over the `stretches`, at least 2, from their first to their last."""
+        """Returns instants (ns) spread evenly over the `stretches`, both ends included; `number` is at least 2."""
         return self._instants_at(evenly_spaced(0, self._num_instants - 1, number))
 
     def spans(self, number: int, share: float) -> Int64[np.ndarray, "number 2"]:
-        """First and last instant (ns) of spans, equally long and spread evenly over the `stretches`.
+        """Returns first and last instant (ns) of equally long spans, spread evenly over the `stretches`.
 
         Args:
-            number: Of the spans.
-            share: Of the instants of the stretches that all spans have together, above 0 and at most 1.
+            number: Number of spans.
+            share: Total length of the spans as a share of the stretches, above 0 and at most 1.
         """
         length = max(int(share * self._num_instants) // number, 1)
         middles = (2 * np.arange(number) + 1) * self._num_instants // (2 * number)
@@ -366,32 +363,34 @@ class EventRecording:
         return int((ends - begins + 1).sum())
 
     def _instants_at(self, places: Int64[np.ndarray, " places"]) -> Int64[np.ndarray, " places"]:
-        """Instants (ns) of the stretches by their number, from 0."""
+        """Returns the instants (ns) with these numbers, which count the nanoseconds of all stretches from 0."""
         begins, ends = self.stretches.T
         after = np.cumsum(ends - begins + 1)
         return places + (ends + 1 - after)[np.searchsorted(after, places, "right")]
 
     def in_left_out_gaps(self, times: Int64[np.ndarray, " times"]) -> Bool[np.ndarray, " times"]:
-        """Which times (ns) lie in gaps of the poses and are therefore not used; none where gaps are kept."""
+        """Returns which times (ns) are not used because they lie in gaps of the poses; none if gaps are kept."""
         return self.trajectory.in_gaps(times) & (not self.keep_pose_gaps)
 
     def knows_poses(self, frames: Frames) -> Bool[np.ndarray, " frames"]:
-        """Which frames have poses throughout their exposure, outside the gaps that are not used."""
+        """Returns which frames have poses during their whole exposure, outside gaps that are not used."""
         opens, closes = frames.exposed.T
         covered = frames.trajectory.covers(opens) & frames.trajectory.covers(closes)
         return covered & (self.keep_pose_gaps | ~frames.trajectory.in_gaps(opens, closes))
 
     @property
     def has_frames(self) -> bool:
-        """Whether there are frames of any kind."""
+        """Whether there are sharp or blurred frames."""
         return self.frames is not None or self.blurred_frames is not None
 
     def locate(self, index: int) -> str:
-        """File and line, or number, of an event of the stream, for error messages."""
-        return self.locate_event(index) if self.locate_event else f"{self.path}, event {index + 1},"
+        """Returns the file, and the line or number, of event number `index` of the stream, for error messages."""
+        if self.locate_event:
+            return self.locate_event(index)
+        return f"{self.event_files[0] if len(self.event_files) == 1 else self.path}, event {index + 1}"
 
     def __deepcopy__(self, memo: dict) -> EventRecording:
-        """The recording itself: it is read-only and large, and Nerfstudio copies what it hands to data sets."""
+        """Returns the recording itself, which is read-only and large; Nerfstudio copies the input of data sets."""
         return self
 
     def _check_what_is_stated(self) -> None:
@@ -432,7 +431,7 @@ class EventRecording:
             object.__setattr__(self, name, value)
 
     def _set_files_of_recording(self) -> None:
-        """Has frames of all kinds take the same value for white."""
+        """Makes frames of all kinds use the same value of full brightness."""
         kinds = ("frames", "blurred_frames", "held_out_frames")
         all_frames = {kind: frames for kind in kinds if (frames := getattr(self, kind)) is not None}
         files = tuple(file for frames in all_frames.values() for file in frames.filenames)
@@ -441,7 +440,7 @@ class EventRecording:
                 self._set(**{kind: replace(frames, files_of_recording=files)})
 
     def _covered(self, frames: Frames | None, what: str, notes: list[str], shares: dict[str, float]) -> Frames | None:
-        """The frames within the poses; says in notes and shares what was left out."""
+        """Returns the frames within the poses; adds to notes and shares if some are left out."""
         if frames is None:
             return None
         steps, poses = np.diff(frames.times), frames.trajectory.end - frames.trajectory.start
@@ -479,7 +478,7 @@ def _check_exposures(times: Int64[np.ndarray, " frames"], exposures: Int64[np.nd
 
 
 def _is_response(name: object) -> bool:
-    """Whether a text has the form of a response's name, whatever offsets a sensor allows."""
+    """Returns whether a text has the form of a response's name, with any offset above 0."""
     if name == "linlog":
         return True
     kind, _, offset = name.partition(":") if isinstance(name, str) else ("", "", "")
@@ -528,19 +527,19 @@ def _without_lenses(recording: EventRecording) -> EventRecording:
 
 
 def overlaps(one: Int64[np.ndarray, "ones 2"], other: Int64[np.ndarray, "others 2"]) -> Int64[np.ndarray, "overlaps 2"]:
-    """First and last instant of each part of time that lies in both, each in order and apart."""
+    """Returns the intervals that lie in both lists of disjoint intervals (first and last instant), in order."""
     begins = np.maximum(one[:, None, 0], other[:, 0])
     ends = np.minimum(one[:, None, 1], other[:, 1])
     return np.stack([begins, ends], axis=-1)[begins <= ends]
 
 
 def left_out(dropped: int, total: int, what: str) -> str:
-    """A note about frames or events that lie outside the poses."""
+    """Returns a note about frames or events outside the poses."""
     return f"{dropped:,} of {total:,} {what} ({percent(dropped / total)}) lie outside the poses and are left out."
 
 
 def percent(share: float) -> str:
-    """A share in [0, 1] as it is shown, with two digits and never as a power of ten."""
+    """Returns a share in [0, 1] in per cent as text with two digits."""
     value = 100 * share
     if 0 < value < 0.01:
         return "less than 0.01 %"
@@ -548,10 +547,10 @@ def percent(share: float) -> str:
 
 
 def nanoseconds(time: float) -> int:
-    """A time in seconds, as a user gives it, in nanoseconds."""
+    """Returns a time in seconds as nanoseconds."""
     return round(time * 1e9)
 
 
 def seconds(time: int) -> str:
-    """A time in nanoseconds as it is shown."""
+    """Returns a time in nanoseconds as text in seconds."""
     return f"{int(time) * 1e-9:.6f} s"

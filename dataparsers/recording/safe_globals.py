@@ -1,4 +1,4 @@
-"""What torch may load of a checkpoint of Nerfstudio, whatever the method."""
+"""Types that torch may load from a checkpoint of any method of Nerfstudio."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
-    """Let torch 2.6 and later load the learning rates that Nerfstudio's scheduler stores as NumPy scalars."""
+    """Allows torch 2.6 and later to load the learning rates that Nerfstudio's scheduler stores as NumPy scalars."""
     scalar: Any = np.float64(0).__reduce__()[0]
     torch.serialization.add_safe_globals(
         [

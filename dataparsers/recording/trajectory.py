@@ -1,4 +1,4 @@
-"""Where the camera was at any time: slerp for rotation, a cubic spline for translation, batched in torch."""
+"""Camera poses at any time: slerp for rotation, a cubic spline for translation, batched in torch."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 GAP_RATIO = 10
-"""Factor by which a gap between poses is longer than the median interval; the spline guesses within it."""
+"""Least length of a gap between poses, as a multiple of the median interval. Poses within a gap are guesses."""
 
 MIN_GAP = 100_000_000
 """Shortest gap between poses, ns. A hand turns the camera by many degrees within a gap of this length."""
 
 
 def evenly_spaced(start: int, end: int, number: int) -> Int64[np.ndarray, " number"]:
-    """Instants from `start` to `end` (ns), both included, each rounded down; exact, which `np.linspace` is not.
+    """Returns instants from `start` to `end` (ns), both included, each rounded down; `np.linspace` is not exact.
 
     Args:
-        start, end: ns from any zero; start + i * (end - start) / (number - 1) is computed in integers.
-        number: At least 2.
+        start, end: Nanoseconds from any zero; start + i * (end - start) / (number - 1) is computed in integers.
+        number: Number of instants, at least 2.
     """
     whole, rest = divmod(int(end) - int(start), number - 1)
     steps = np.arange(number, dtype=np.int64)
@@ -55,7 +55,7 @@ class Trajectory:
     ):
         self.times, self.positions, self.quaternions = times, positions, quaternions
         self.body: tuple[Trajectory, Float64[np.ndarray, "4 4"]] | None = None
-        """What this camera is mounted on, and its pose there, if it is a trajectory `of_mounted`."""
+        """The body of this camera, and the camera's pose there, if `of_mounted` made this trajectory."""
         if not len(times) == len(positions) == len(quaternions):
             raise ValueError(
                 f"A trajectory needs one position and one quaternion for each time, but got {len(times)} times, "
@@ -82,10 +82,10 @@ class Trajectory:
         }
 
     def of_mounted(self, body_from_camera: Float64[np.ndarray, "4 4"]) -> Trajectory:
-        """The trajectory of a camera that is fixed to this body.
+        """Returns the trajectory of a camera that is fixed to this body.
 
         Args:
-            body_from_camera: Pose of the camera in the axes of the body, metres: the extrinsics.
+            body_from_camera: The extrinsics: pose of the camera in the axes of the body, metres.
         """
         bodies, mount = Rotation.from_quat(self.quaternions), Rotation.from_matrix(body_from_camera[:3, :3])
         mounted = Trajectory(
@@ -95,43 +95,46 @@ class Trajectory:
         return mounted
 
     def covers(self, times: Int64[Tensor | np.ndarray, "*batch"]) -> Bool[Tensor | np.ndarray, "*batch"]:
-        """Which times (ns) lie between the first and the last pose, both included."""
+        """Returns which times (ns) lie between the first and the last pose, both included."""
         return (times >= self.start) & (times <= self.end)
 
     @property
     def longest_step(self) -> int:
-        """Longest time (ns) between two poses that their own rate explains."""
+        """Longest time (ns) between two poses that is not a gap."""
         return max(int(GAP_RATIO * np.median(np.diff(self.times))), MIN_GAP)
 
     @cached_property
     def gaps(self) -> Int64[np.ndarray, "gaps 2"]:
-        """Times (ns) of each two poses that are further apart than `longest_step`; between them, poses are guesses."""
+        """Times (ns) of the poses at both ends of each gap that is longer than `longest_step`."""
         before = np.flatnonzero(np.diff(self.times) > self.longest_step)
         return np.stack([self.times[before], self.times[before + 1]], axis=1)
 
     def in_gaps(
         self, times: Int64[np.ndarray, "*batch"], ends: Int64[np.ndarray, "*batch"] | None = None
     ) -> Bool[np.ndarray, "*batch"]:
-        """Which times (ns), or what from them to the ends (ns), lie within one of the `gaps`; the poses at a gap's ends
-        are known."""
+        """Returns which times (ns), or intervals from times to ends (ns), overlap one of the `gaps`.
+
+        The poses at the ends of a gap are known, so they are not in it.
+        """
         ends = times if ends is None else ends
         return np.searchsorted(self.gaps[:, 0], ends) > np.searchsorted(self.gaps[:, 1], times, "right")
 
     def poses(
         self, times: Int64[Tensor, "*batch"], delays: Float64[Tensor, "*batch"] | None = None
     ) -> Float64[Tensor, "*batch 3 4"]:
-        """Camera-to-world matrices [R | t] (OpenCV axes, metres) at the given times, on their device.
+        """Returns camera-to-world matrices [R | t] (OpenCV axes, metres) at the given times, on their device.
 
         With segment i from t_i to t_{i+1}, its rotation axis k (camera axes) and angle, and phi the part of the angle
         passed at time t, Rodrigues' formula gives R(t) = R_i (1 + sin(phi) [k]x + (1 - cos(phi)) [k]x^2).
 
         Args:
             times: Nanoseconds.
-            delays: Nanoseconds, of any sign, that are added to the times; the poses are differentiable in them. None:
-                none.
+            delays: Nanoseconds, of any sign, that are added to the times; the poses are differentiable in them.
+                Default: no delays.
 
         Raises:
-            ValueError: A time outside [start, end]. On a GPU, where looking would wait for it, its pose is NaN.
+            ValueError: A time is outside [start, end]. On a GPU the pose is NaN instead, since a check would wait for
+                the GPU.
         """
         fraction = None
         if delays is not None:

@@ -10,8 +10,9 @@ from jaxtyping import Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.formats.columns import FARTHEST
 from enerf_ns.dataparsers.formats.registry import read_recording
-from enerf_ns.dataparsers.formats.text_tables import FARTHEST, parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 

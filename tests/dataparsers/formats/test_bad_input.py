@@ -181,12 +181,12 @@ DAVIS = [
     BadInput(
         "quaternion not unit",
         edit_line("groundtruth.txt", 5, times_cells(slice(4, 8), 1.01)),
-        ("groundtruth.txt, line 5 holds a quaternion of norm 1.01", "unit quaternions"),
+        ("groundtruth.txt, line 5, holds a quaternion of norm 1.01", "unit quaternions"),
     ),
     BadInput(
         "quaternion zero",
         edit_line("groundtruth.txt", 5, times_cells(slice(4, 8), 0.0)),
-        ("groundtruth.txt, line 5 holds a quaternion of norm 0", "unit quaternions"),
+        ("groundtruth.txt, line 5, holds a quaternion of norm 0", "unit quaternions"),
     ),
     BadInput("calibration short", write("calib.txt", "330 340 11 8"), ("calib.txt, line 1 has 4 columns", "but 9")),
     BadInput(
@@ -281,7 +281,7 @@ ESIM = [
         "quaternion NaN", edit_line("0_poses_all.txt", 4, cell(4, "nan")), ("line 4 holds 'nan'", "finite number")
     ),
     BadInput(
-        "quaternion not unit", edit_line("0_poses_all.txt", 4, cell(4, "1")), ("line 4 holds a quaternion", "unit")
+        "quaternion not unit", edit_line("0_poses_all.txt", 4, cell(4, "1")), ("line 4, holds a quaternion", "unit")
     ),
     BadInput(
         "poses_bounds of LLFF without bounds", save("poses_bounds.npy", np.zeros((9, 15))), ("(9, 15)", "(N, 17)")
@@ -337,7 +337,7 @@ ESIM = [
     BadInput(
         "camera without focal length",
         write("simulation.json", json.dumps({"camera": {"width": 24, "height": 18}})),
-        ("simulation.json holds camera", "fx, fy"),
+        ("simulation.json lacks camera.fx",),
     ),
 ]
 

@@ -289,7 +289,7 @@ def test_the_published_calibration_is_the_real_one(layouts: dict[str, Path], sha
     published = eds.read(raw)
     assert list(with_camchain.notes) == []
     assert list(published.notes) == [
-        "The published calibration of EDS is used, since no Kalibr camchain (*camchain*.yaml) lies in raw or in a "
+        "The published calibration of EDS is used, since there is no Kalibr camchain (*camchain*.yaml) in raw or in a "
         "calibration folder beside it."
     ]
     assert published.camera == with_camchain.camera
@@ -384,7 +384,7 @@ def test_a_camchain_in_the_folder_or_in_a_calibration_folder_beside_it(
     recording = eds.read(raw)
     assert focal_lengths(recording) == (700.0, 550.0)
     assert list(recording.notes) == (
-        [] if place.startswith("eds/") else [f"The calibration is that of {tmp_path / place}."]
+        [] if place.startswith("eds/") else [f"The calibration is read from {tmp_path / place}."]
     )
 
 
@@ -426,7 +426,7 @@ def test_the_event_camera_may_be_the_first_in_the_camchain(raw: Path, plain: Sce
 def test_a_camchain_that_calls_both_the_event_camera(raw: Path):
     text = (raw / "camchain.yaml").read_text()
     (raw / "camchain.yaml").write_text(text.replace("cam0:", "cam0: # events").replace("cam1:", "cam1: # events"))
-    assert "says both of cam0 and of cam1 that it is the event camera" in error_of(raw)
+    assert "names both cam0 and cam1 as the event camera" in error_of(raw)
 
 
 @pytest.mark.parametrize(
@@ -461,7 +461,7 @@ def test_prepared_in_place_the_prepared_files_are_used(prepared: Path):
     assert recording.camera.model == "lookup"
     assert recording.frames is not None and recording.frames.filenames[0].parent.name == UNDISTORTED
     assert list(recording.notes) == [
-        f"{POSES} and {POSES_US} are there; {POSES_US} is on the clock of events.h5 and is used."
+        f"Of {POSES} and {POSES_US}, {POSES_US} is used, which is on the clock of events.h5."
     ]
 
 
@@ -473,14 +473,12 @@ def test_prepared_but_for_the_events_the_unpacked_files_are_used(prepared: Path)
     assert recording.trajectory.start == 0
     assert recording.frames is not None and recording.frames.filenames[0].parent.name == "images"
     assert recording.frames.times[0] == 30_000_000
-    assert list(recording.notes) == [
-        f"{POSES} and {POSES_US} are there; {POSES} is on the clock of events.h5 and is used."
-    ]
+    assert list(recording.notes) == [f"Of {POSES} and {POSES_US}, {POSES} is used, which is on the clock of events.h5."]
 
 
 def test_an_interrupted_conversion_of_the_events_is_noticed(prepared: Path):
     shift_events(prepared, EPOCH, slice(600, None))
-    assert f"events.h5 holds times of {POSES} and of {POSES_US} in one" in error_of(prepared)
+    assert f"events.h5 holds times of the clock of {POSES} and of {POSES_US}" in error_of(prepared)
 
 
 def test_an_offset_of_another_recording_is_noticed(prepared: Path):
@@ -523,7 +521,8 @@ def test_no_images(raw: Path):
     remove(raw, "images")
     recording = eds.read(raw)
     assert recording.frames is None
-    assert list(recording.notes) == [f"There are stamps of images, but no folder images/ or {UNDISTORTED}/ with these."]
+    (note,) = recording.notes
+    assert note == f"There are stamps of images, but no folder images/ or {UNDISTORTED}/, so no frame is used."
     remove(raw, STAMPS)
     recording = eds.read(raw)
     assert recording.frames is None and list(recording.notes) == []
@@ -621,27 +620,27 @@ RAW_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "camchain with a tab": (write("camchain.yaml", "cam0:\n\tcamera_model: omni\n"), "camchain.yaml, line 2, cannot"),
     "camchain unclosed": (write("camchain.yaml", "cam0: {fx: 1\n\ncam1: 2"), "camchain.yaml, line 3, cannot"),
     "camchain of OpenCV": (write("camchain.yaml", "%YAML:1.0\n---\nK: !!opencv-matrix\n"), "cannot be read as YAML"),
-    "camchain of a list": (write("camchain.yaml", "- cam0\n- cam1\n"), "holds no cam0 and cam1"),
-    "empty camchain": (write("camchain.yaml", ""), "holds no cam0 and cam1"),
-    "one camera": (write("camchain.yaml", "cam0: {camera_model: pinhole}\n"), "holds no cam0 and cam1"),
-    "omni": (in_camchain("cam0", "camera_model", "omni"), "camera_model omni with distortion_model radtan of cam0"),
-    "fov": (in_camchain("cam1", "distortion_model", "fov"), "camera_model pinhole with distortion_model fov of cam1"),
-    "three intrinsics": (in_camchain("cam1", "intrinsics", [1.0, 2.0, 3.0]), "holds intrinsics: [1.0, 2.0, 3.0] of"),
-    "words": (in_camchain("cam1", "intrinsics", "fx fy cx cy"), "holds intrinsics: fx fy cx cy of cam1, but 4 numbers"),
-    "nan": (in_camchain("cam0", "distortion_coeffs", [0, 0, 0, float("nan")]), "distortion_coeffs: [0, 0, 0, nan]"),
+    "camchain of a list": (write("camchain.yaml", "- cam0\n- cam1\n"), "camchain.yaml lacks cam0, which was expected"),
+    "empty camchain": (write("camchain.yaml", ""), "camchain.yaml lacks cam0, which was"),
+    "one camera": (write("camchain.yaml", "cam0: {camera_model: pinhole}\n"), "lacks cam0.distortion_model, which was"),
+    "omni": (in_camchain("cam0", "camera_model", "omni"), 'holds cam0.camera_model = "omni", but one of pinhole'),
+    "fov": (in_camchain("cam1", "distortion_model", "fov"), 'holds cam1.distortion_model = "fov", but one of'),
+    "three intrinsics": (in_camchain("cam1", "intrinsics", [1.0, 2.0, 3.0]), "cam1.intrinsics = [1.0, 2.0, 3.0]"),
+    "words": (in_camchain("cam1", "intrinsics", "fx fy cx cy"), 'holds cam1.intrinsics = "fx fy cx cy", but 4'),
+    "nan": (in_camchain("cam0", "distortion_coeffs", [0, 0, 0, float("nan")]), "distortion_coeffs = [0, 0, 0, NaN]"),
     "fx below 0": (in_camchain("cam0", "intrinsics", [-700, 700, 320, 240]), "cam0, holds the focal lengths -700"),
     "half a pixel": (in_camchain("cam0", "resolution", [640.5, 480]), "cam0, holds a camera of 640.5 x 480 pixels"),
     "another sensor": (in_camchain("cam1", "resolution", [346, 260]), "calibrates an event camera of 346 x 260"),
     "another RGB": (in_camchain("cam0", "resolution", [512, 384]), "has 640 x 480 pixels, but 512 x 384"),
     "no lens": (in_camchain("cam1", "distortion_coeffs", [-4, 0, 0, 0]), "which fits no lens"),
     "no RGB lens": (in_camchain("cam0", "distortion_coeffs", [-4, 0, 0, 0]), "which fits no lens"),
-    "no extrinsics": (in_camchain("cam1", "T_cn_cnm1", None), "holds T_cn_cnm1: None of cam1, but 4 x 4 numbers"),
-    "3 x 4": (in_camchain("cam1", "T_cn_cnm1", np.eye(3, 4).tolist()), "of cam1, but 4 x 4 numbers were expected"),
-    "stretched": (in_camchain("cam1", "T_cn_cnm1", turn(1.01 * np.eye(3))), "T_cn_cnm1 of cam1, whose rotation is no"),
-    "mirrored": (in_camchain("cam1", "T_cn_cnm1", turn(np.diag([1, 1, -1]))), "T_cn_cnm1 of cam1, whose rotation is"),
+    "no extrinsics": (in_camchain("cam1", "T_cn_cnm1", None), "lacks cam1.T_cn_cnm1, which was expected"),
+    "3 x 4": (in_camchain("cam1", "T_cn_cnm1", np.eye(3, 4).tolist()), "but a matrix of 4 x 4 numbers was expected"),
+    "stretched": (in_camchain("cam1", "T_cn_cnm1", turn(1.01 * np.eye(3))), "T_cn_cnm1 whose upper left 3 x 3 part is"),
+    "mirrored": (in_camchain("cam1", "T_cn_cnm1", turn(np.diag([1, 1, -1]))), "T_cn_cnm1 whose upper left 3 x 3 part"),
     "column by column": (
         in_camchain("cam1", "T_cn_cnm1", (np.eye(4) + np.diag([0.1], -3)).tolist()),
-        "T_cn_cnm1 of cam1, whose last row must be 0 0 0 1",
+        "cam1.T_cn_cnm1 whose last row is [0.1",
     ),
 }  # fmt: skip
 
@@ -662,15 +661,15 @@ PREPARED_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a list": (write(INTRINSICS, "[1, 2]"), f"{INTRINSICS} holds a list, but a JSON object"),
     "one camera": (
         write(INTRINSICS, '{"intrinsics_undistorted": [{"fx": 1, "fy": 1, "cx": 1, "cy": 1}]}'),
-        f"{INTRINSICS} holds no intrinsics_undistorted with numbers fx fy cx cy",
+        f"{INTRINSICS} holds intrinsics_undistorted = [{{",
     ),
     "no number": (
         write(INTRINSICS, '{"intrinsics_undistorted": [0, {"fx": "wide", "fy": 1, "cx": 1, "cy": 1}]}'),
-        f"{INTRINSICS} holds no intrinsics_undistorted with numbers fx fy cx cy",
+        f'{INTRINSICS} holds intrinsics_undistorted[1].fx = "wide", but a number was expected',
     ),
     "nan": (
         write(INTRINSICS, '{"intrinsics_undistorted": [0, {"fx": NaN, "fy": 1, "cx": 1, "cy": 1}]}'),
-        f"{INTRINSICS} holds no intrinsics_undistorted with numbers fx fy cx cy",
+        f"{INTRINSICS} holds intrinsics_undistorted[1].fx = NaN, but a number was expected",
     ),
     "truncated map": (cut(MAP, 0.5), f"{MAP} cannot be read as an HDF5 file with a rectify map (Unable"),
     "no map in it": (cut(MAP, 0), f"{MAP} is empty"),

@@ -325,7 +325,7 @@ def edit_views(edit: Callable[[dict], object]) -> Callable[[Path], None]:
     [
         (
             edit_views(lambda content: content.update(frames=content["frames"][:1])),
-            "lists 1 views, of which at least 2",
+            "lists 1 views, but at least 2",
         ),
         (lambda folder: (folder / "views/transforms_test.json").rename(folder / "x"), "holds neither transforms_test"),
         (lambda folder: [file.unlink() for file in folder.glob("views/test/*.png")], "none is there as .png or .jpg"),
@@ -453,7 +453,7 @@ BAD_INPUT = {
     ),
     "polarity short": (
         save(EVENTS_FILE, polarity=np.zeros(3999, bool)),
-        "holds 4,000 positions, 4,000 timestamps and 3,999 polarities, but as many of each",
+        "holds 4,000 positions, 4,000 timestamps, 3,999 polarities, but as many of each",
     ),
     "no event": (
         save(EVENTS_FILE, position=np.zeros((0, 2), int), timestamp=np.zeros(0, int), polarity=np.zeros(0, bool)),
@@ -482,7 +482,7 @@ BAD_INPUT = {
     "poses in microseconds": (save(POSES_FILE, T_wc_timestamp=TIMES // 1000), "does not fit together; state the times"),
     "poses in seconds": (
         save(POSES_FILE, T_wc_timestamp=TIMES // 10**9),
-        "holds 40 poses of which 39 follow another one within 1 µs; give one pose a time, and times in nanoseconds",
+        "holds 40 poses, but 39 of them follow another one within 1 µs; give one pose for each time, and times in nano",
     ),
     "pose times float": (save(POSES_FILE, T_wc_timestamp=TIMES * 1e-9), "T_wc_timestamp as float64 of shape (40,)"),
     "one pose": (
@@ -491,7 +491,7 @@ BAD_INPUT = {
     ),
     "pose times too many": (
         save(POSES_FILE, T_wc_timestamp=np.r_[TIMES, TIMES[-1] + 10**7]),
-        "holds 41 times, 40 positions and 40 orientations, but as many of each",
+        "holds 41 times, 40 positions, 40 orientations, but as many of each",
     ),
     "rotations of matrices": (
         save(POSES_FILE, T_wc_orientation=Rotation.from_quat(QUATERNIONS).as_matrix()),
@@ -499,11 +499,11 @@ BAD_INPUT = {
     ),
     "position NaN": (
         save(POSES_FILE, T_wc_position=changed(POSITIONS, (4, 1), np.nan)),
-        "camera_poses.npz holds a position or quaternion that is not finite in pose 5",
+        "camera_poses.npz, pose 5, holds the position [",
     ),
     "quaternion not unit": (
         save(POSES_FILE, T_wc_orientation=changed(QUATERNIONS, 6, 1.0)),
-        "camera_poses.npz holds a quaternion of norm 2 in pose 7, but rotations are unit quaternions",
+        "camera_poses.npz, pose 7, holds a quaternion of norm 2, but rotations are unit quaternions",
     ),
     "threshold negative": (
         save(CALIBRATION_FILE, neg_contrast_threshold=-0.25),
@@ -539,10 +539,10 @@ BAD_INPUT = {
     "intrinsics transposed": (save(CALIBRATION_FILE, intrinsics=MATRIX.T), "whose last row is [80.5, 58.5, 1.0], but"),
     "views no JSON": (write("views/transforms_test.json", b"{"), "transforms_test.json cannot be read as JSON ("),
     "views a list": (write("views/transforms_test.json", b"[]"), "transforms_test.json holds a list, but a JSON"),
-    "views of numbers": (write("views/transforms_test.json", b'{"frames": [1, 2]}'), "holds no list of frames"),
+    "views of numbers": (write("views/transforms_test.json", b'{"frames": [1, 2]}'), "lacks frames[0].transform_m"),
     "views without angle": (
         edit_views(lambda content: content.pop("camera_angle_x")),
-        "holds camera_angle_x = None, but the angle of view in radians, or intrinsics, was expected",
+        "transforms_test.json lacks camera_angle_x, which was expected",
     ),
     "views of an angle in degrees": (
         edit_views(lambda content: content.update(camera_angle_x=40)),
@@ -550,32 +550,32 @@ BAD_INPUT = {
     ),
     "view without pose": (
         edit_views(lambda content: content["frames"][1].pop("transform_matrix")),
-        "holds no transform_matrix of frame 2 of 4 x 4 numbers",
+        "lacks frames[1].transform_matrix, which was expected",
     ),
     "view of a ragged pose": (
         edit_views(lambda content: content["frames"][1].update(transform_matrix=[[1, 2], [3]])),
-        "holds no transform_matrix of frame 2 of 4 x 4 numbers",
+        "holds frames[1].transform_matrix = [[1, 2], [3]], but a matrix of 4 x 4 numbers was",
     ),
     "view of no rotation": (
         edit_views(lambda content: content["frames"][2].update(transform_matrix=(2 * np.eye(4)).tolist())),
-        "holds a transform_matrix of frame 3 that is no rotation, since it is off orthonormal by 3",
+        "frames[2].transform_matrix whose upper left 3 x 3 part is no rotation, since it is off orthonormal by 3",
     ),
     "view mirrored": (
         edit_views(lambda content: content["frames"][2].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist())),
-        "holds a transform_matrix of frame 3 that is no rotation, since it is off orthonormal by 0",
+        "frames[2].transform_matrix whose upper left 3 x 3 part is no rotation, since it is off orthonormal by 0",
     ),
     "view missing": (
         lambda folder: (folder / "views/test/r_1.png").unlink(),
-        "transforms_test.json lists './test/r_1' as frame 2, but",
+        'transforms_test.json holds frames[1].file_path = "./test/r_1", but a .png or .jpg in',
     ),
     "view without name": (
         edit_views(lambda content: content["frames"][0].pop("file_path")),
-        "transforms_test.json lists None as frame 1, but",
+        "transforms_test.json lacks frames[0].file_path, which was expected",
     ),
     "view no image": (write("views/test/r_1.png", b"hello"), "r_1.png cannot be read as an image"),
     "view of another size": (
         lambda folder: Image.new("RGB", (20, 10)).save(folder / "views/test/r_2.png"),
-        "r_2.png has 20 x 10 pixels, but r_0.png has 160 x 120",
+        "r_2.png has 20 x 10 pixels, but 160 x 120 of its camera were expected",
     ),
 }  # fmt: skip
 

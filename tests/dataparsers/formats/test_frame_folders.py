@@ -42,9 +42,9 @@ def test_neither_images_nor_stamps_are_no_frames(tmp_path: Path):
 @pytest.mark.parametrize(
     ("counts", "sentence"),
     [
-        ({"num_stamps": 2}, r"holds 3 images, but its stamps\.txt holds 2 stamps; give one each\.$"),
-        ({"num_images": 0, "num_depths": 0}, r"holds 0 images, but its stamps\.txt holds 3 stamps; give one each\.$"),
-        ({"num_depths": 1}, r"holds 1 depth maps, but .* holds 3 images; give one each\.$"),
+        ({"num_stamps": 2}, r"holds 3 images, but its stamps\.txt holds 2 stamps; give one for each image\.$"),
+        ({"num_images": 0, "num_depths": 0}, r"holds 0 images, but its stamps\.txt holds 3 stamps; give one for each"),
+        ({"num_depths": 1}, r"holds 1 depth maps, but .* holds 3 images; give one for each image\.$"),
     ],
 )
 def test_counts_that_differ_are_refused(tmp_path: Path, counts: dict[str, int], sentence: str):

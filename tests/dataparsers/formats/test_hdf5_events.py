@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from enerf_ns.dataparsers.formats import hdf5_events
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectify_map
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectified_camera
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 
 NUM_EVENTS = 5000
@@ -154,14 +155,17 @@ def without(name: str) -> dict[str, np.ndarray]:
         (without("t"), "lacks the dataset t in its root"),
         ({"t": columns()["t"]}, "lacks the datasets x, y, p in its root"),
         ({}, "lacks the datasets x, y, t, p in its root"),
-        (columns() | {"t": columns()["t"] * 1e-6}, "holds t as float64, but whole microseconds (integers) were"),
-        (columns() | {"x": columns()["x"].astype(np.float32)}, "holds x as float32, but integers were expected"),
-        (columns() | {"x": columns()["x"] > 3}, "holds x as bool, but integers were expected"),
-        (columns() | {"p": columns()["p"].astype(complex)}, "holds p as complex128, but integers were expected"),
-        (columns() | {"p": np.full(NUM_EVENTS, b"on")}, "holds p as |S2, but integers were expected"),
+        (
+            columns() | {"t": columns()["t"] * 1e-6},
+            "holds t as float64 of shape (5000,), but one whole number for each event (t in µs)",
+        ),
+        (columns() | {"x": columns()["x"].astype(np.float32)}, "holds x as float32"),
+        (columns() | {"x": columns()["x"] > 3}, "holds x as bool"),
+        (columns() | {"p": columns()["p"].astype(complex)}, "holds p as complex128"),
+        (columns() | {"p": np.full(NUM_EVENTS, b"on")}, "holds p as |S2"),
         (columns() | {"y": columns()["y"][:-7]}, "holds 5,000 x, 4,993 y, 5,000 t, 5,000 p, but as many of each"),
-        (columns() | {"y": columns()["y"][:, None]}, "holds y as an array of shape (5000, 1), but one number"),
-        (columns() | {"y": np.uint16(3)}, "holds y as an array of shape (), but one number an event"),
+        (columns() | {"y": columns()["y"][:, None]}, "holds y as uint16 of shape (5000, 1), but one whole number"),
+        (columns() | {"y": np.uint16(3)}, "holds y as uint16 of shape (), but one whole number"),
         (columns(0), "holds no events"),
         (columns() | {"t": columns()["t"] * 1000}, "µs, which is beyond 146 years"),
         (columns() | {"t": np.full(NUM_EVENTS, 2**64 - 1, np.uint64)}, "µs, which is beyond 146 years"),
@@ -309,6 +313,9 @@ def test_flipped_bytes_give_a_sentence_or_events(tmp_path: Path, storage: dict):
     assert failures > 0
 
 
+UNDISTORTED = Camera(24, 18, 20.0, 21.0, 11.5, 8.5)
+
+
 def write_map(path: Path, rectify_map: np.ndarray, name: str = "rectify_map", **storage) -> Path:
     with h5py.File(path, "w") as file:
         file.create_dataset(name, data=rectify_map, **storage)
@@ -323,7 +330,10 @@ def plain_map(width: int = 24, height: int = 18) -> np.ndarray:
 @pytest.mark.parametrize("storage", [{}, {**hdf5plugin.Blosc()}])
 def test_a_rectify_map(tmp_path: Path, storage: dict):
     path = write_map(tmp_path / "map.h5", plain_map(), **storage)
-    np.testing.assert_array_equal(read_rectify_map(path, 24, 18), plain_map())
+    camera = read_rectified_camera(path, UNDISTORTED)
+    directions = (plain_map().astype(float) - [UNDISTORTED.cx, UNDISTORTED.cy]) / [UNDISTORTED.fx, UNDISTORTED.fy]
+    np.testing.assert_array_equal(camera.pixel_directions()[..., :2], directions)
+    assert camera.undistorted() == UNDISTORTED
 
 
 @pytest.mark.parametrize(
@@ -340,7 +350,7 @@ def test_a_rectify_map(tmp_path: Path, storage: dict):
 def test_what_is_no_rectify_map(tmp_path: Path, rectify_map: np.ndarray, name: str, message: str):
     path = write_map(tmp_path / "map.h5", rectify_map, name)
     with pytest.raises(RecordingError) as caught:
-        read_rectify_map(path, 24, 18)
+        read_rectified_camera(path, UNDISTORTED)
     assert str(caught.value).startswith(f"{path} ") and message in str(caught.value)
 
 
@@ -349,6 +359,6 @@ def test_a_truncated_or_missing_rectify_map(tmp_path: Path):
     shutil.copy(path, tmp_path / "cut.h5")
     (tmp_path / "cut.h5").write_bytes(path.read_bytes()[:-100])
     with pytest.raises(RecordingError, match="truncated file"):
-        read_rectify_map(tmp_path / "cut.h5", 24, 18)
+        read_rectified_camera(tmp_path / "cut.h5", UNDISTORTED)
     with pytest.raises(RecordingError, match="is missing; an HDF5 file with a rectify map was expected there"):
-        read_rectify_map(tmp_path / "none.h5", 24, 18)
+        read_rectified_camera(tmp_path / "none.h5", UNDISTORTED)

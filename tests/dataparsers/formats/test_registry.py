@@ -142,7 +142,7 @@ def test_flags_are_made_from_the_options_of_all_formats(basket: Path, capsys: py
         tyro.cli(flags, args=["--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "For a recording of basket: Which of the baskets is read. None: red." in shown
-    assert "For a recording of tum_vie: Which of the two event cameras is read" in shown
+    assert "For a recording of tum_vie: The event camera that is read" in shown
 
 
 def test_a_layout_that_can_only_be_read():

@@ -61,5 +61,5 @@ def test_poses_are_normalised_with_a_note_and_refused_far_off(tmp_path: Path):
     np.testing.assert_array_equal(positions, [[1, 2, 3], [1, 2, 4]])
     np.testing.assert_allclose(quaternions, [[0, 0, 0, 1], [0.6, 0, 0, 0.8]], atol=1e-15)
     assert len(notes) == 1 and notes[0].startswith("1 of 2 quaternions in table.txt were off norm 1 by up to 0.0005")
-    with pytest.raises(RecordingError, match=r"line 2 holds a quaternion of norm 1\.1"):
+    with pytest.raises(RecordingError, match=r"line 2, holds a quaternion of norm 1\.1"):
         read_poses(table(tmp_path, "0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1.1\n"), "s", [])

@@ -69,10 +69,10 @@ def test_one_selection_is_indexed_once_and_another_one_by_itself():
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ([24, 2, 6, 1], r"memory, event 2, holds x = 24, which lies outside the sensor of 24 x 18 pixels"),
-        ([1, 18, 6, 1], r"memory, event 2, holds y = 18, which lies outside the sensor"),
-        ([1, 2, 4, 1], r"memory, event 2, goes back in time from 0\.000000 s to 0\.000000 s"),
-        ([1, 2, 6, 7], r"memory, event 2, holds polarity 7, but"),
+        ([24, 2, 6, 1], r"memory, event 2 holds x = 24, which lies outside the sensor of 24 x 18 pixels"),
+        ([1, 18, 6, 1], r"memory, event 2 holds y = 18, which lies outside the sensor"),
+        ([1, 2, 4, 1], r"memory, event 2 goes back in time from 0\.000000 s to 0\.000000 s"),
+        ([1, 2, 6, 7], r"memory, event 2 holds polarity 7, but"),
     ],
 )
 def test_what_is_wrong_with_an_event_is_said_with_its_number(row: list[int], message: str):

@@ -70,7 +70,7 @@ def test_a_distortion_without_inverse_is_refused():
         (dict(distortion=(0.1, 0.2, 0.3, float("nan"))), "of the model radtan, but finite numbers"),
         (dict(model="fisheye"), "of the model fisheye, but finite numbers k1 k2 k3 k4"),
         (dict(model="pinhole"), "of the model pinhole, but no coefficients"),
-        (dict(model="lookup", distortion=()), "without a table of where each pixel looks"),
+        (dict(model="lookup", distortion=()), "without a table of directions of its pixels"),
         (dict(model="lookup", distortion=(), directions=np.zeros((240, 180, 2))), r"of shape \(240, 180, 2\), but"),
         (dict(model="lookup", distortion=(), directions=np.full((180, 240, 2), np.nan)), "but finite numbers"),
         (
