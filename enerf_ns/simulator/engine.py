@@ -30,9 +30,6 @@ from enerf_ns.simulator.settings import SimulationSettings, resolve
 from enerf_ns.simulator.sources import Pictures, RenderedScene, Source, TrainedRun
 from enerf_ns.simulator.view import View, view_of
 
-FRAME_RATE, EXPOSURE_MS = 41.0, 20.0
-"""Frames per second, and exposure of blurred frames in milliseconds, if neither a preset nor a setting states them."""
-
 WINDOW = 10**9
 """Nanoseconds of the recording whose times of rendering are computed at once."""
 
@@ -118,14 +115,13 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
 def _exposures(settings: SimulationSettings, view: View) -> Exposures:
     """Exposures of evenly spaced frames, in whole microseconds."""
     preset, length = settings.preset, view.end - view.start
-    rate = preset.num_frames / preset.duration if preset else FRAME_RATE
     assert settings.layout is not None
     fewest = writer_of(settings.layout).fewest_frames
-    count = settings.num_frames or max(fewest, round(rate * length * 1e-9))
+    count = settings.num_frames or max(fewest, round(preset.num_frames / preset.duration * length * 1e-9))
     exposure_ms = settings.exposure_ms
     if exposure_ms is None:
         longest = max(0, length // count // 2000 - 1) * 2e-3
-        exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, longest)
+        exposure_ms = min(preset.exposure_ms, longest)
     exposure = round(exposure_ms * 500) * 2000
     if count * 1000 > length or (count == 1 and exposure > length):
         raise FlagError(
@@ -256,7 +252,7 @@ def _stated(settings: SimulationSettings, view: View, exposures: Exposures) -> d
     stated["duration"] = (view.end - view.start) * 1e-9
     stated["num_frames"], stated["exposure_ms"] = len(exposures.times), exposures.exposure * 1e-6
     if settings.scene and not (settings.pictures or settings.key_frames or settings.trajectory):
-        stated["motion"] = settings.motion or (settings.preset.motion if settings.preset else "shake")
+        stated["motion"] = settings.motion or settings.preset.motion
     return json.loads(json.dumps(stated, default=str))
 
 

@@ -2,7 +2,7 @@
 
 Scene, motion, strength of blur, size and number of frames follow the paper. The paper does not state speed, exposure
 and field of view; they are chosen here so that the presets of `ns-train` with the same names suit the simulated
-sequences.
+sequences. `USUAL` has the values for all other scenes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from enerf_ns.simulator.trajectories import MOTIONS
 
 @dataclass(frozen=True)
 class SimulationPreset:
-    """Settings of one sequence."""
+    """Values of settings that are left out."""
 
-    scene: Literal["roads", "moon"]
-    """Name of the scene in `scenes.SCENES`."""
+    scene: Literal["roads", "moon"] | None
+    """Name of the scene in `scenes.SCENES`; None for any other scene."""
     motion: Literal["shake", "spiral"]
     """Motion of the camera: forward-facing with abrupt turns, or an inward spiral."""
-    turns_per_second: float
-    """Reversals per second of a shaking camera, or rounds per second of a spiral."""
+    turns_per_second: float | None
+    """Reversals per second of a shaking camera, or rounds per second of a spiral; None for the motion's default."""
     num_frames: int
     """Number of frames, as in the configs of the paper."""
     duration: float
@@ -33,7 +33,7 @@ class SimulationPreset:
     exposure_ms: float
     """Exposure of the blurred frames, milliseconds."""
     blur: float
-    """Motion of the picture during an exposure, pixels: mean over pixels, frames and many seeds."""
+    """Motion of the picture during an exposure, pixels: mean over pixels, frames and many seeds; nan if unknown."""
     width: int = 640
     """Width of events and frames, pixels."""
     height: int = 480
@@ -45,8 +45,8 @@ class SimulationPreset:
 
     def trajectory(self, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> Trajectory:
         """The trajectory of this preset; for the arguments see `trajectories.shake`."""
-        duration = round(self.duration * 1e9)
-        return MOTIONS[self.motion](duration, camera, target, rng, self.turns_per_second)
+        turns = () if self.turns_per_second is None else (self.turns_per_second,)
+        return MOTIONS[self.motion](round(self.duration * 1e9), camera, target, rng, *turns)
 
 
 PRESETS = {
@@ -59,3 +59,8 @@ PRESETS = {
     ),
 }
 """Presets by name. Blur is mild (spiral1, spiral2, shake-moon1), medium (shake-moon2) or strong (shake-carpet1)."""
+
+USUAL = SimulationPreset(
+    None, "shake", None, num_frames=41, duration=1.0, exposure_ms=20.0, blur=float("nan"), width=160, height=120
+)
+"""Values for all other scenes."""

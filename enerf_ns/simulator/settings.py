@@ -13,7 +13,7 @@ from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.files import expanded
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
-from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
+from enerf_ns.simulator.paper_sequences import PRESETS, USUAL, SimulationPreset
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT
 from enerf_ns.simulator.scene.scenes import SCENES
 
@@ -108,9 +108,9 @@ class SimulationSettings:
         return tuple(Path(path) for path in read if path)
 
     @property
-    def preset(self) -> SimulationPreset | None:
-        """The preset that `scene` names, if it names one."""
-        return PRESETS.get(self.scene or "")
+    def preset(self) -> SimulationPreset:
+        """Values of settings that are left out: those of the preset that `scene` names, else `USUAL`."""
+        return PRESETS.get(self.scene or "", USUAL)
 
 
 DEFAULTS = {setting.name: setting.default for setting in fields(SimulationSettings)}
@@ -137,8 +137,10 @@ def resolve(settings: SimulationSettings) -> SimulationSettings:
         )
     _check_use(settings, layout)
     sensor = settings.sensor
-    thresholds = settings.contrast_thresholds or (settings.preset and settings.preset.contrast_thresholds)
-    if thresholds:
+    thresholds = settings.contrast_thresholds
+    if thresholds is None and settings.scene in PRESETS:
+        thresholds = settings.preset.contrast_thresholds
+    if thresholds is not None:
         sensor = replace(sensor, contrast_thresholds=thresholds)
     return replace(settings, layout=layout, sensor=sensor)
 

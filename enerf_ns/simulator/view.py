@@ -23,11 +23,7 @@ from enerf_ns.simulator.scene.scenes import SCENES, Scene
 from enerf_ns.simulator.scene.view_check import check_view
 from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, Source, TrainedRun, Video
-from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
-
-SECONDS, SIZE, FIELD_OF_VIEW = 1.0, (160, 120), 60.0
-"""Duration (s), width and height (pixels) and horizontal field of view (degrees) of a recording, if neither a preset
-nor a setting states them."""
+from enerf_ns.simulator.trajectories import POSES_PER_SECOND, from_file, key_frames, sampled
 
 MOST_PIXELS = 2**24
 """Most pixels of a camera. Rendering takes up to a kilobyte of memory for each."""
@@ -81,13 +77,13 @@ def _pictures_view(settings: SimulationSettings, path: Path) -> View:
         source = ImageFolder(path, rate, stamps, gamma=settings.gamma, response=response)
     else:
         source = Video(path, rate, settings.gamma, response)
-    camera = _centred(source.width, source.height, settings.field_of_view or FIELD_OF_VIEW)
+    camera = _centred(source.width, source.height, settings.field_of_view or settings.preset.field_of_view)
     return View(source, None, None, camera, camera, np.eye(4), source.start, _end(settings, source.end, str(path)))
 
 
 def _run_view(settings: SimulationSettings, config: Path, notes: list[str]) -> View:
-    duration = _duration(settings) or round(SECONDS * 1e9)
-    run = TrainedRun(absolute(config), _given_trajectory(settings, notes), duration)
+    duration = settings.duration or settings.preset.duration
+    run = TrainedRun(absolute(config), _given_trajectory(settings, notes), round(duration * 1e9))
     if settings.width or settings.height or settings.field_of_view:
         run.camera = _pinhole(settings, run.camera)
     end = _end(settings, run.end, str(settings.trajectory or settings.key_frames or config))
@@ -125,7 +121,7 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
     Raises:
         RecordingError: The name of the scene is not known, or the mesh file cannot be used.
     """
-    name = settings.preset.scene if settings.preset else settings.scene
+    name = settings.preset.scene or settings.scene
     assert name is not None
     if name in SCENES:
         scene = SCENES[name](np.random.default_rng(settings.sensor.seed).spawn(2)[0])
@@ -143,12 +139,9 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
 def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator, notes: list[str]) -> Trajectory:
     """Trajectory of the event camera, with as many poses per second as the layout has."""
     trajectory, preset = _given_trajectory(settings, notes), settings.preset
-    if trajectory is None and preset is not None:
+    if trajectory is None:
         moved = replace(preset, duration=settings.duration or preset.duration, motion=settings.motion or preset.motion)
         trajectory = moved.trajectory(scene.camera, scene.target, rng)
-    elif trajectory is None:
-        motion, duration = MOTIONS[settings.motion or "shake"], _duration(settings) or round(SECONDS * 1e9)
-        trajectory = motion(duration, scene.camera, scene.target, rng)
     assert settings.layout is not None
     poses_per_second = writer_of(settings.layout).poses_per_second
     if poses_per_second is None:
@@ -195,13 +188,10 @@ def _check_size(width: int, height: int) -> None:
 
 def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera:
     """Pinhole camera of the settings; what they leave out is taken from another camera or the preset."""
-    usual, angle = SIZE, FIELD_OF_VIEW
-    if like is not None:
-        usual, angle = (like.width, like.height), 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
-    elif settings.preset is not None:
-        usual, angle = (settings.preset.width, settings.preset.height), settings.preset.field_of_view
-    width = settings.width or max(1, round((settings.height or usual[1]) * usual[0] / usual[1]))
-    height = settings.height or max(1, round(width * usual[1] / usual[0]))
+    usual = like or settings.preset
+    angle = settings.preset.field_of_view if like is None else 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
+    width = settings.width or max(1, round((settings.height or usual.height) * usual.width / usual.height))
+    height = settings.height or max(1, round(width * usual.height / usual.width))
     return _centred(width, height, settings.field_of_view or angle)
 
 
@@ -212,16 +202,13 @@ def _centred(width: int, height: int, field_of_view: float) -> Camera:
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 
 
-def _duration(settings: SimulationSettings) -> int | None:
-    """Duration of the recording in the settings, ns."""
-    return None if settings.duration is None else round(settings.duration * 1e9)
-
-
 def _end(settings: SimulationSettings, last: int, name: str) -> int:
     """End of the recording (ns), if the source called `name` ends at `last` (ns)."""
-    wanted = _duration(settings)
-    if wanted is not None and wanted > last:
+    if settings.duration is None:
+        return last
+    end = round(settings.duration * 1e9)
+    if end > last:
         raise FlagError(
             f"--duration is {settings.duration:g} s, but {name} lasts {last * 1e-9:.9g} s; give less or leave it out."
         )
-    return last if wanted is None else wanted
+    return end

@@ -57,7 +57,7 @@ class Renderer:
     """
 
     def __init__(self, scene: Scene, camera: Camera, places: Float64[np.ndarray, "places 2"] = SAMPLES):
-        self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
+        self.scene, self.camera = scene, camera
         self._samples, self._centres = _Samples.of(camera, places), _Samples.of(camera, CENTRE)
 
     def brightness(
