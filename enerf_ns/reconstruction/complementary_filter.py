@@ -1,4 +1,4 @@
-"""The complementary filter of events alone, which makes frames without learning."""
+"""The complementary filter for events, which reconstructs frames without a network."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from enerf_ns.dataparsers.recording.recording import Events
 
 
 class ComplementaryFilter:
-    """Log brightness by pixel, of which each event adds its threshold, and which decays to 0 between events.
+    """A high-pass filter of the log brightness of each pixel, exact in time.
 
-    Scheerlinck, Barnes and Mahony, Continuous-time Intensity Estimation Using Event Cameras, ACCV 2018, without frames:
-    a high-pass filter of log brightness, exact in time.
+    Each event adds its contrast threshold to the log brightness of its pixel, which decays to 0 between events. This is
+    the filter of Scheerlinck, Barnes and Mahony, Continuous-time Intensity Estimation Using Event Cameras, ACCV 2018,
+    without frames.
 
     Args:
-        width, height: Of the sensor, pixels.
-        contrast_thresholds: Of on and of off events, change of log brightness.
-        cutoff_frequency: Hz; brightness that changes more slowly is forgotten. 0: nothing is.
-        start: Time before all events, ns.
+        width, height: Size of the sensor, pixels.
+        contrast_thresholds: Thresholds of on and off events, changes of log brightness.
+        cutoff_frequency: Hz. The filter forgets slower changes of brightness; with 0 it forgets nothing.
+        start: A time before all events, ns.
     """
 
     def __init__(
@@ -35,22 +36,18 @@ class ComplementaryFilter:
         self._times = np.full((height, width), start)
 
     def add(self, events: Events) -> None:
-        """Takes in the next events in time order."""
+        """Adds the next events, in order of time."""
         columns = events.x, events.y, events.t, events.p > 0
         compiled(_integrate)(*columns, *self._thresholds, self._decay, self._log_brightness, self._times)
 
     def log_brightness(self, time: int) -> Float[np.ndarray, "height width"]:
-        """Of each pixel at an instant (ns) not before the last event, against its mean over the past."""
+        """Log brightness of each pixel relative to its past mean, at a time (ns) not before the last event."""
         return self._log_brightness * np.exp(-self._decay * (time - self._times))
 
     def frame(self, time: int) -> Float32[np.ndarray, "height width"]:
-        """Brightness at an instant (ns) not before the last event, smoothed along edges."""
-        smooth = cv2.bilateralFilter(self.log_brightness(time).astype(np.float32), *SMOOTHING)
-        return np.exp(smooth)
-
-
-SMOOTHING = (5, 1.0, 1.0)
-"""OpenCV's bilateral filter: width of the neighbourhood in pixels, deviations of log brightness and of pixels."""
+        """Brightness at a time (ns) not before the last event, smoothed but for its edges."""
+        log_brightness = self.log_brightness(time).astype(np.float32)
+        return np.exp(cv2.bilateralFilter(log_brightness, d=5, sigmaColor=1.0, sigmaSpace=1.0))
 
 
 def _integrate(x, y, t, on, on_threshold, off_threshold, decay, log_brightness, times):

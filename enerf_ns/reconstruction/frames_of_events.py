@@ -1,4 +1,4 @@
-"""Frames of events at given instants: the events of a recording, streamed through a network or a filter."""
+"""Reconstructs frames at given times: streams the events of a recording through a network or a filter."""
 
 from __future__ import annotations
 
@@ -16,34 +16,33 @@ from enerf_ns.reconstruction.networks import Network, State
 from enerf_ns.reconstruction.voxel_grid import normalised, voxel_grid
 
 EVENTS_PER_PIXEL = 0.35
-"""Events of a window that a network looks at, for each pixel of the sensor, as E2VID's authors suggest."""
-
+"""Events per pixel of the sensor in one window of a network, as the authors of E2VID suggest."""
 
 NO_EVENTS = Events(*(np.zeros(0, np.int64) for _ in "xytp"))
-"""A piece of a stream without events."""
+"""A part of a stream without events."""
 
 
 class Reconstruction(Protocol):
-    """Makes frames of events."""
+    """A method that reconstructs frames from events."""
 
     name: str
-    """What it is, in words."""
+    """Name of the method in printed sentences."""
 
     def add(self, events: Events) -> None:
-        """Takes in the next events in time order."""
+        """Adds the next events, in order of time."""
 
     def frame(self, time: int) -> Float32[np.ndarray, "height width"]:
-        """Brightness, of any scale, at an instant (ns) not before the last event."""
+        """Brightness, on any scale, at a time (ns) not before the last event."""
         ...
 
 
 class NetworkReconstruction:
-    """A recurrent network that looks at one window of events after the other.
+    """A recurrent network that reads the events window by window.
 
     Args:
         network: E2VID or FireNet.
-        name: What it is, in words.
-        width, height: Of the sensor, pixels.
+        name: Name of the method in printed sentences.
+        width, height: Size of the sensor, pixels.
     """
 
     def __init__(self, network: Network, name: str, width: int, height: int):
@@ -65,7 +64,7 @@ class NetworkReconstruction:
             self._waiting = [part(waiting, first, len(waiting))]
 
     def frame(self, time: int) -> Float32[np.ndarray, "height width"]:
-        """As the network shows it after all events up to now: what waits is looked at in windows of one size."""
+        """The frame after all added events; the waiting events are read in windows of about equal size."""
         waiting = joined([NO_EVENTS, *self._waiting])
         self._waiting = []
         if len(waiting) or self._frame is None:
@@ -77,7 +76,7 @@ class NetworkReconstruction:
 
     @torch.inference_mode()
     def _look_at(self, events: Events) -> None:
-        """One window, padded on the right and below with places that have no events."""
+        """Passes one window of events to the network, padded on the right and below with pixels without events."""
         right, below = (-size % self._network.size_multiple for size in (self._width, self._height))
         grid = normalised(voxel_grid(events, self._network.num_bins, self._width, self._height))
         grid = torch.nn.functional.pad(grid, (0, right, 0, below))[None].to(self._device)
@@ -88,15 +87,15 @@ class NetworkReconstruction:
 def reconstruct_frames(
     recording: EventRecording, reconstruction: Reconstruction, times: Int64[np.ndarray, " frames"]
 ) -> Iterator[Float32[np.ndarray, "height width"]]:
-    """Frames of the event camera at some instants, from the events that training uses: without those of hot pixels.
+    """Frames of the event camera at some times, from the events that training uses, which leaves out hot pixels.
 
     Args:
-        recording: Whose events are streamed.
-        reconstruction: New.
-        times: In the order of time, ns.
+        recording: The recording.
+        reconstruction: A method that has not seen any events.
+        times: Times of the frames in increasing order, ns.
 
     Raises:
-        RecordingError: As of `index_events`.
+        RecordingError: `index_events` cannot read the events.
     """
     camera, (start, end) = recording.camera, recording.span
     hot = np.zeros(camera.width * camera.height, bool)
@@ -115,14 +114,14 @@ def reconstruct_frames(
 
 
 def split_at(stream: Iterable[Events], times: Int64[np.ndarray, " times"]) -> Iterator[tuple[Events, int | None]]:
-    """The events of a stream in pieces, none of which reaches beyond the next of some instants.
+    """Splits a stream of events after each of some times.
 
     Args:
-        stream: In time order.
-        times: In order, ns.
+        stream: Events in order of time.
+        times: Times in increasing order, ns.
 
     Yields:
-        A piece, and the instant (ns) up to and with which it is the last one, or None.
+        A part of the stream, and the time (ns) if the part is the last one up to and including this time, else None.
     """
     number = 0
     for events in stream:
@@ -138,10 +137,10 @@ def split_at(stream: Iterable[Events], times: Int64[np.ndarray, " times"]) -> It
 
 
 def joined(pieces: list[Events]) -> Events:
-    """Pieces of a stream as one."""
+    """Consecutive parts of a stream, joined to one."""
     return Events(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in "xytp"))
 
 
 def part(events: Events, first: int, stop: int) -> Events:
-    """Some consecutive events."""
+    """The events from index `first` up to but without index `stop`."""
     return Events(*(getattr(events, name)[first:stop] for name in "xytp"))

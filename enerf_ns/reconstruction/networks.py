@@ -1,4 +1,6 @@
-"""The networks E2VID and FireNet, which make frames of events, in the names and shapes of their published checkpoints.
+"""The networks E2VID and FireNet, which reconstruct frames from events.
+
+Names and shapes of the layers are those of the published checkpoints.
 
 Rebecq et al., High Speed and High Dynamic Range Video with an Event Camera, TPAMI 2020; Scheerlinck et al., Fast Image
 Reconstruction with an Event Camera, WACV 2020.
@@ -20,11 +22,11 @@ from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import reading
 
 State = tuple[Tensor, ...]
-"""What a recurrent layer remembers, each [batch, channels, height, width]; the first is its output too."""
+"""State of a recurrent layer: tensors [batch, channels, height, width], of which the first is also its output."""
 
 
 class ConvGRU(nn.Module):
-    """Gated recurrent unit of convolutions (Ballas et al., ICLR 2016)."""
+    """Convolutional gated recurrent unit (Ballas et al., ICLR 2016)."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -41,7 +43,7 @@ class ConvGRU(nn.Module):
 
 
 class ConvLSTM(nn.Module):
-    """Long short-term memory of convolutions (Shi et al., NeurIPS 2015), without peepholes."""
+    """Convolutional long short-term memory (Shi et al., NeurIPS 2015), without peepholes."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -55,7 +57,7 @@ class ConvLSTM(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution, and what may follow it: batch normalisation, ReLU."""
+    """A convolution, optionally followed by batch normalisation and ReLU."""
 
     def __init__(
         self, inputs: int, outputs: int, size: int, stride: int = 1, batch_norm: bool = False, relu: bool = True
@@ -71,14 +73,14 @@ class Convolution(nn.Module):
 
 
 class Upsampling(Convolution):
-    """A convolution of a picture enlarged to twice its size."""
+    """Enlarges a picture to twice its size, then applies a convolution."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(functional.interpolate(x, scale_factor=2.0, mode="bilinear"))
 
 
 class TransposedConvolution(nn.Module):
-    """A transposed convolution to twice the size, batch normalisation where there is some, and ReLU."""
+    """A transposed convolution to twice the size, optional batch normalisation, and ReLU."""
 
     def __init__(self, inputs: int, outputs: int, size: int, batch_norm: bool):
         super().__init__()
@@ -90,7 +92,7 @@ class TransposedConvolution(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two convolutions whose result is added to their input (He et al., CVPR 2016)."""
+    """Two convolutions with a skip connection (He et al., CVPR 2016)."""
 
     def __init__(self, channels: int, batch_norm: bool = False):
         super().__init__()
@@ -102,7 +104,7 @@ class Residual(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """A layer and the recurrent one behind it."""
+    """A layer followed by a recurrent layer."""
 
     def __init__(self, conv: nn.Module, recurrent_block: nn.Module):
         super().__init__()
@@ -117,7 +119,7 @@ class FireNet(nn.Module):
 
     name = "FireNet"
     size_multiple = 1
-    """Width and height must be multiples of this."""
+    """Factor that must divide width and height."""
 
     def __init__(self, num_bins: int, channels: int):
         super().__init__()
@@ -133,10 +135,10 @@ class FireNet(nn.Module):
 
         Args:
             grid: Normalised voxel grid.
-            states: As after the window before; None for the first one.
+            states: States after the window before; None for the first window.
 
         Returns:
-            The frame, and the states.
+            The frame, and the states after this window.
         """
         first, second = states or (None, None)
         first = self.head(grid, first)
@@ -177,7 +179,7 @@ class E2VID(nn.Module):
     def forward(
         self, grid: Float[Tensor, "batch num_bins height width"], states: Sequence[State] | None
     ) -> tuple[Float[Tensor, "batch height width"], list[State]]:
-        """As `FireNet.forward`; the frame is in [0, 1]."""
+        """The frame at the end of a window, in [0, 1], and the states; for the arguments see `FireNet.forward`."""
         x = head = self.head(grid)
         new_states: list[State] = []
         for encoder, state in zip(self.encoders, states or [None] * len(self.encoders), strict=True):
@@ -193,13 +195,14 @@ Network = FireNet | E2VID
 
 
 def load_network(path: Path) -> Network:
-    """The network of a checkpoint, ready to use; which one it is, is found out. Code in the file is not run.
+    """The network of a checkpoint, in evaluation mode. Its type and size are inferred from the layers.
 
     Args:
-        path: What `torch.save` wrote: a state dict, or a dict with one under "state_dict".
+        path: A state dict written by `torch.save`, or a dict with a state dict under "state_dict". Code in the file is
+            not run.
 
     Raises:
-        RecordingError: The file is missing, no checkpoint, that of another network, or holds more than tensors and
+        RecordingError: The file is missing, is no checkpoint, holds another network, or holds more than tensors and
             plain values.
     """
     layers = _read_layers(path)
@@ -215,7 +218,7 @@ def load_network(path: Path) -> Network:
 
 
 def _read_layers(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint, by their names from the network on, without that of the module around it."""
+    """The tensors of a checkpoint by name, without the name of a module around the network."""
     try:
         with reading(path, "a checkpoint of PyTorch"):
             if tarfile.is_tarfile(path):
@@ -235,7 +238,7 @@ def _read_layers(path: Path) -> dict[str, Tensor]:
 
 
 def _network_for(layers: Mapping[str, Tensor]) -> Network:
-    """The network that has layers of these shapes; KeyError or ValueError where there is none."""
+    """The network with layers of these shapes; raises KeyError or ValueError if there is none."""
     if "head.conv.conv2d.weight" in layers:
         channels, num_bins, *_ = layers["head.conv.conv2d.weight"].shape
         return FireNet(num_bins, channels)

@@ -1,4 +1,4 @@
-"""A recording with frames that are reconstructed from its events, to learn from in place of those of a camera."""
+"""Writes a recording with frames reconstructed from its events, for training in place of frames of a camera."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from enerf_ns.reconstruction.frames_of_events import NetworkReconstruction, reco
 from enerf_ns.reconstruction.networks import load_network
 
 DEFAULT_FRAMES_PER_SECOND = 30.0
-"""Frames reconstructed per second of a recording that has none."""
+"""Frame rate for a recording without frames, frames per second."""
 
 DEFAULT_CUTOFF_FREQUENCY = 0.5
-"""Of the complementary filter, Hz. Of 0, 0.05, 0.1, 0.2, 0.5, 1 and 2, its frames resemble the true ones of
-slider_depth the most with this one, and those of a simulated shake nearly so (correlation 0.62 and 0.85; with 1: 0.56
-and 0.86)."""
+"""Cut-off frequency of the complementary filter, Hz. Among 0, 0.05, 0.1, 0.2, 0.5, 1 and 2 Hz, 0.5 Hz gives the highest
+correlation with the true frames of slider_depth (0.62; 1 Hz: 0.56) and nearly the highest with those of a simulated
+shake (0.85; 1 Hz: 0.86)."""
 
 HIGHEST_CUTOFF_FREQUENCY = 1000.0
-"""Highest of the complementary filter, Hz."""
+"""Highest cut-off frequency of the complementary filter, Hz."""
 
 MOST_FRAMES = 100_000
-"""Most frames that are reconstructed of one recording."""
+"""Most frames that are reconstructed for one recording."""
 
 RANGE_PERCENTILES = (1.0, 99.0)
-"""Percentiles of the brightness of all frames that become black and white; one range for all, since a field has one
-brightness. With a range of its own for each, FireNet's frames of slider_depth vary more (their mean grey value by 5.7
-against 4.1, that of the true ones by 1.6) at the same correlation (0.69)."""
+"""Percentiles of the brightness of all frames that become black and white. All frames share one range, since a field
+has one brightness. With a range for each frame, the mean grey value of FireNet's frames of slider_depth varies more
+(5.7 grey levels instead of 4.1; true frames: 1.6), at the same correlation (0.69)."""
 
 SAMPLED_PIXELS = 10_000_000
-"""Pixels of all frames, spread evenly, of which the percentiles are taken at most."""
+"""Most pixels, spread evenly over all frames, from which the percentiles are computed."""
 
 
 def reconstruct(
@@ -55,29 +55,29 @@ def reconstruct(
     cutoff_frequency: float | None = None,
     **options: object,
 ) -> list[str]:
-    """Writes a recording into a new folder of the layout event_recording, with frames reconstructed from its events.
+    """Writes a recording in the layout event_recording, with frames reconstructed from its events.
 
-    They stand as blurred frames beside the sharp ones, at the same instants, so that training learns from them and
-    evaluation looks at the sharp ones. All of them are scaled to 8 bits alike.
+    The reconstructed frames are written as blurred frames, at the times of the sharp frames: training learns from the
+    blurred frames, and evaluation uses the sharp frames. All reconstructed frames are scaled to 8 bits alike.
 
     Args:
-        source: Folder of a recording of any registered format; only read.
-        output_dir: New or empty folder, which is whole afterwards or not there.
-        weights: Checkpoint of E2VID or FireNet; None: a complementary filter.
-        frames_per_second: For a recording without frames; None: `DEFAULT_FRAMES_PER_SECOND`.
-        cutoff_frequency: Of the complementary filter, Hz; None: `DEFAULT_CUTOFF_FREQUENCY`.
-        options: Of the format, by name.
+        source: Folder of a recording in any registered format; it is only read.
+        output_dir: New or empty folder. After an error it is not there.
+        weights: Checkpoint of E2VID or FireNet. Default: a complementary filter.
+        frames_per_second: Frame rate for a recording without frames. Default: `DEFAULT_FRAMES_PER_SECOND`.
+        cutoff_frequency: Cut-off frequency of the complementary filter, Hz. Default: `DEFAULT_CUTOFF_FREQUENCY`.
+        options: Options of the format, by name.
 
     Returns:
-        What was found, and what is left out, in sentences.
+        Sentences about what was found and what was left out.
 
     Raises:
         RecordingError: The recording or the weights cannot be used.
-        FlagError: The format lacks an option, or something is given that changes nothing or is out of range.
-        OutputError: The folder holds something, lies in the recording, or cannot be written.
+        FlagError: The format lacks an option, or an argument changes nothing or is out of range.
+        OutputError: The folder is not empty, lies in the recording, or cannot be written.
     """
     if weights is not None and cutoff_frequency is not None:
-        raise FlagError("--cutoff-frequency is of the complementary filter, but --weights were given; leave one out.")
+        raise FlagError("--cutoff-frequency is for the complementary filter, but --weights were given; leave one out.")
     if cutoff_frequency is None:
         cutoff_frequency = DEFAULT_CUTOFF_FREQUENCY
     if not 0 <= cutoff_frequency <= HIGHEST_CUTOFF_FREQUENCY:
@@ -88,8 +88,8 @@ def reconstruct(
         recording = read_recording(source, **options)  # type: ignore[arg-type]
         if recording.bayer_pattern is not None:
             raise RecordingError(
-                f"{source} is of a sensor with the colour filter {recording.bayer_pattern}, but frames are "
-                "reconstructed of grey sensors alone."
+                f"{source} was recorded by a sensor with the colour filter {recording.bayer_pattern}, but frames are "
+                "reconstructed for grey sensors only."
             )
         camera = recording.camera
         if weights is not None:
@@ -120,13 +120,13 @@ def reconstruct(
 def _instants(
     recording: EventRecording, frames_per_second: float | None
 ) -> tuple[Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"]]:
-    """Times (ns) of the frames, and their numbers: those of the recording's frames, or evenly spaced."""
+    """Times (ns) and numbers of the frames to reconstruct: those of the recording's frames, or evenly spaced ones."""
     frames = recording.frames or recording.blurred_frames
     if frames is not None:
         if frames_per_second is not None:
             raise FlagError(
                 f"--frames-per-second is for recordings without frames, but {recording.path} has {len(frames.times)}, "
-                "at whose instants frames are reconstructed; leave it out."
+                "at whose times frames are reconstructed; leave it out."
             )
         return frames.times, frames.numbers
     rate = DEFAULT_FRAMES_PER_SECOND if frames_per_second is None else frames_per_second
@@ -144,18 +144,18 @@ def _instants(
 def _write_frames(
     frames: Iterable[Float32[np.ndarray, "height width"]], size: tuple[int, int], folder: Path
 ) -> tuple[Path, ...]:
-    """Writes frames as 8-bit PNG, all scaled alike, and holds one of them at a time.
+    """Writes frames as 8-bit PNG files, all scaled alike; holds one frame in memory at a time.
 
     Args:
-        frames: Brightness of any scale.
+        frames: Brightness, on any scale.
         size: Width and height, pixels.
-        folder: Exists and is empty.
+        folder: An empty folder.
 
     Returns:
         The files.
 
     Raises:
-        ValueError: All frames are of one brightness; a sentence that can follow "RECORDING holds".
+        ValueError: All frames have one brightness; the message continues "RECORDING holds".
         OSError: The disk is full.
     """
     stored, width, height = folder / "brightness.npy", *size
@@ -167,7 +167,7 @@ def _write_frames(
     pixels = brightness.reshape(-1)
     black, white = np.percentile(pixels[:: len(pixels) // SAMPLED_PIXELS + 1], RANGE_PERCENTILES)
     if not white > black:
-        raise ValueError("no frame that is not of one brightness, since hardly an event comes before one")
+        raise ValueError("only frames of one uniform brightness, since hardly any events come before them")
     files = tuple(folder / f"{number:05d}.png" for number in range(len(brightness)))
     for file, frame in zip(files, brightness, strict=True):
         shades = 255.0 * ((frame - black) / (white - black)).clip(0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Events of a window of time as a voxel grid, the input of networks that reconstruct frames."""
+"""Voxel grids of events, the input of networks that reconstruct frames."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from enerf_ns.dataparsers.recording.recording import Events
 
 
 def voxel_grid(events: Events, num_bins: int, width: int, height: int) -> Float32[Tensor, "num_bins height width"]:
-    """Polarities summed by pixel and time, each event shared linearly by two bins (Zhu et al., CVPR 2019).
+    """Sums of polarities by pixel and time bin; each event is split linearly between two bins (Zhu et al., CVPR 2019).
 
     Args:
-        events: In time order; the first lies in the middle of bin 0 and the last in that of the last bin.
-        num_bins: At least 2.
-        width, height: Of the sensor, pixels.
+        events: Events in order of time. The first lies in the middle of the first bin, the last in the middle of the
+            last bin.
+        num_bins: Number of time bins, at least 2.
+        width, height: Size of the sensor, pixels.
     """
     since_first = (events.t - events.t[:1]).astype(np.float64)
     places = since_first * ((num_bins - 1) / since_first.max(initial=1.0))
@@ -30,9 +31,9 @@ def voxel_grid(events: Events, num_bins: int, width: int, height: int) -> Float3
 
 
 def normalised(grid: Float32[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
-    """The grid with mean 0 and standard deviation 1 of its voxels that are not 0; those that are stay so.
+    """The grid, scaled so that its nonzero voxels have mean 0 and standard deviation 1; zeros stay 0.
 
-    Where all of these are equal, they stay as they are.
+    A grid whose nonzero voxels are all equal is returned as it is.
     """
     filled = grid != 0
     values = grid[filled]

@@ -1,5 +1,5 @@
-"""`enerf simulate`: a recording of an event camera, with frames, depth and poses, of anything that has a picture at any
-time: scenes made from a seed, meshes, folders of images, videos, trained runs."""
+"""`enerf simulate`: simulates a recording of an event camera, with frames, depth and poses, from scenes drawn by a
+seed, meshes, folders of images, videos, or trained runs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Simulate:
     """New folder for the recording."""
     settings: Annotated[SimulationSettings, tyro.conf.arg(name="")] = field(default_factory=SimulationSettings)
     log_eps: Optional[float] = None  # noqa: UP045
-    """Short for --response logarithm:EPS."""
+    """Short form of --response logarithm:EPS."""
     preview: bool = False
-    """Write preview.mp4 too: frame, blurred frame, events and depth side by side."""
+    """Write the video preview.mp4 too: frame, blurred frame, events and depth side by side."""
 
     def main(self) -> None:
         settings = self.settings

@@ -1,4 +1,4 @@
-"""Simulates a recording: events, frames, depth and poses of what is looked at, written as they come."""
+"""Simulates a recording: events, frames, depth and poses, written while they are made."""
 
 from __future__ import annotations
 
@@ -30,42 +30,38 @@ from enerf_ns.simulator.settings import SimulationSettings, resolve
 from enerf_ns.simulator.sources import Pictures, RenderedScene, Source, TrainedRun
 from enerf_ns.simulator.view import View, view_of
 
-FRAME_RATE, EXPOSURE_MS = 41.0, 20.0
-"""Frames per second, and exposure of blurred frames in milliseconds, where neither a preset nor a setting states
-them."""
-
 WINDOW = 10**9
-"""Nanoseconds of the recording for which it is found out at once when to render."""
+"""Nanoseconds of the recording whose times of rendering are computed at once."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What was simulated."""
+    """Summary of a simulated recording."""
 
     folder: Path
     """Folder of the recording."""
     duration: int
-    """Length of the recording, ns."""
+    """Duration of the recording, ns."""
     num_events: int
     num_frames: int
     has_poses: bool
-    """Whether the recording has poses; False for pictures, on which nothing can be trained."""
+    """Whether the recording has poses. Pictures have none, so that no field can be trained on them."""
     notes: tuple[str, ...]
-    """What the user should know, one sentence each."""
+    """One sentence for each thing that the user should know."""
 
 
 def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = False) -> Simulation:
     """Simulates a recording and writes it; shows a progress bar meanwhile.
 
     Args:
-        settings: What is simulated, and how.
-        output_dir: Folder that is new or empty.
-        preview: Write preview.mp4 too: frame, blurred frame, events and depth side by side.
+        settings: Scene, motion and sensors.
+        output_dir: New or empty folder.
+        preview: Whether to write preview.mp4 too: frame, blurred frame, events and depth side by side.
 
     Raises:
-        FlagError: A setting is out of its range, contradicts another, or changes nothing.
+        FlagError: A setting is out of its range, contradicts another one, or changes nothing.
         RecordingError: An input cannot be read or used.
-        OutputError: The folder is not empty, lies within a recording or what else is read, or cannot be made, or the
+        OutputError: The folder is not empty, lies within a recording or another input, or cannot be made; or the
             preview cannot be written.
     """
     output_dir = absolute(output_dir)
@@ -101,10 +97,11 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
         writer = stack.enter_context(open_writer(settings.layout, output_dir, setup))
         video = None
         if preview:
-            video = stack.enter_context(Preview(output_dir / "preview.mp4", view.events.width, view.events.height))
+            size = view.event_camera.width, view.event_camera.height
+            video = stack.enter_context(Preview(output_dir / "preview.mp4", *size))
         _record(settings, view, exposures, camera, _Recorder(settings, writer, video))
     if not writer.num_events:
-        notes.append("There are no events, without which a recording cannot be read; let more change.")
+        notes.append("There are no events, and a recording without events cannot be read; let the camera move more.")
     return Simulation(
         folder=output_dir,
         duration=view.end - view.start,
@@ -116,16 +113,15 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
 
 
 def _exposures(settings: SimulationSettings, view: View) -> Exposures:
-    """Exposures of frames that are evenly spread, in whole microseconds."""
+    """Exposures of evenly spaced frames, in whole microseconds."""
     preset, length = settings.preset, view.end - view.start
-    rate = preset.num_frames / preset.duration if preset else FRAME_RATE
     assert settings.layout is not None
     fewest = writer_of(settings.layout).fewest_frames
-    count = settings.num_frames or max(fewest, round(rate * length * 1e-9))
+    count = settings.num_frames or max(fewest, round(preset.num_frames / preset.duration * length * 1e-9))
     exposure_ms = settings.exposure_ms
     if exposure_ms is None:
         longest = max(0, length // count // 2000 - 1) * 2e-3
-        exposure_ms = min(preset.exposure_ms if preset else EXPOSURE_MS, longest)
+        exposure_ms = min(preset.exposure_ms, longest)
     exposure = round(exposure_ms * 500) * 2000
     if count * 1000 > length or (count == 1 and exposure > length):
         raise FlagError(
@@ -137,12 +133,12 @@ def _exposures(settings: SimulationSettings, view: View) -> Exposures:
 
 
 class _EventCamera:
-    """The event sensor behind its colour filter, if it has one.
+    """The event sensor, behind a colour filter if the settings have one.
 
     Args:
-        settings: Of the simulation.
-        brightness: [height, width] or, in colour, [height, width, 3]: what the sensor sees first.
-        time: At which it sees that, ns.
+        settings: Settings of the simulation.
+        brightness: First picture, linear: [height, width] or, in colour, [height, width, 3].
+        time: Time of the first picture, ns.
     """
 
     def __init__(self, settings: SimulationSettings, brightness: np.ndarray, time: int):
@@ -158,7 +154,7 @@ class _EventCamera:
         return self.sensor.advance(self._seen(render.brightness), render.time, before)
 
     def _seen(self, brightness: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:
-        """What all pixels [height, width], or these [pixels], see of a grey or coloured brightness."""
+        """Brightness behind the filter, [height, width] or [pixels], from a grey or coloured brightness."""
         shape = brightness.shape[: 2 if pixels is None else 1]
         if brightness.ndim == len(shape):
             return brightness
@@ -171,7 +167,7 @@ class _EventCamera:
 def _record(
     settings: SimulationSettings, view: View, exposures: Exposures, camera: _EventCamera, recorder: _Recorder
 ) -> None:
-    """Renders from the first time to the last, and records what the cameras make of it."""
+    """Renders the view from start to end, and records the events and frames of its cameras."""
     stops = np.array([view.start, view.end])
     others: Iterator[Frame] = iter(())
     if view.frames is None:
@@ -200,11 +196,12 @@ def _record(
 def _renders(
     settings: SimulationSettings, source: Source, stops: Int64[np.ndarray, " stops"], max_change: float
 ) -> Iterator[Render]:
-    """Pictures at these times (ns), and as many between them as motion and brightness need."""
+    """Pictures at these times (ns), and as many between them as motion and changes of brightness need."""
     response = response_named(settings.sensor.response)
     if isinstance(source, Pictures):
         times = np.union1d(stops, source.times[(source.times > stops[0]) & (source.times < stops[-1])])
-        max_change = max_change if settings.sensor.cutoff_frequency else np.inf  # else all between is on a line
+        if not settings.sensor.cutoff_frequency:  # then log brightness is linear between pictures
+            max_change = np.inf
         yield from adaptive_renders(source.brightness, times, max_change, response, threads=1)
         return
     assert isinstance(source, RenderedScene | TrainedRun)
@@ -213,12 +210,12 @@ def _renders(
         times = render_times(source.camera, source.trajectory, source.depth, within, settings.max_displacement)
         renders = adaptive_renders(source.brightness, times, max_change, response)
         if start > stops[0]:
-            next(renders)  # the last one of the window before
+            next(renders)  # it is the last picture of the window before
         yield from renders
 
 
 def _frames(settings: SimulationSettings, source: Source, exposures: Exposures) -> Iterator[Frame]:
-    """The frames of a camera of their own, which is only rendered during exposures."""
+    """The frames of a second camera, which is rendered during exposures only."""
     for stops in np.stack([exposures.opens, exposures.times, exposures.closes], axis=1):
         for render in _renders(settings, source, np.unique(stops), np.inf):
             frame = exposures.add(render.time, _shown(settings, render.brightness))
@@ -227,12 +224,12 @@ def _frames(settings: SimulationSettings, source: Source, exposures: Exposures) 
 
 
 def _shown(settings: SimulationSettings, picture: Float[np.ndarray, "height width *channels"]) -> np.ndarray:
-    """What frames show of a picture, in colour or grey."""
+    """The picture in the colours of the frames: R G B, or grey."""
     return picture if settings.colour or picture.ndim == 2 else luma(torch.from_numpy(picture)).numpy()
 
 
 def _setup(settings: SimulationSettings, view: View, exposures: Exposures, sensor: EventSensor) -> Setup:
-    """What is known of the recording before the first picture."""
+    """The facts of the recording that are known before the first picture."""
     return Setup(
         event_camera=view.event_camera,
         frame_camera=view.frame_camera,
@@ -250,29 +247,29 @@ def _setup(settings: SimulationSettings, view: View, exposures: Exposures, senso
 
 
 def _stated(settings: SimulationSettings, view: View, exposures: Exposures) -> dict[str, Any]:
-    """All settings, with what those that are None came to."""
+    """All settings for simulation.json, with the values that were chosen for those left out."""
     stated = {**asdict(settings), "frame_settings": asdict(settings.frame)}
     stated["duration"] = (view.end - view.start) * 1e-9
     stated["num_frames"], stated["exposure_ms"] = len(exposures.times), exposures.exposure * 1e-6
     if settings.scene and not (settings.pictures or settings.key_frames or settings.trajectory):
-        stated["motion"] = settings.motion or (settings.preset.motion if settings.preset else "shake")
+        stated["motion"] = settings.motion or settings.preset.motion
     return json.loads(json.dumps(stated, default=str))
 
 
 class _Recorder:
-    """Where events and frames go: the folder and, if there is one, the preview."""
+    """Passes events and frames to the writer of the folder and, if there is one, to the preview."""
 
     def __init__(self, settings: SimulationSettings, writer: Writer, preview: Preview | None):
         self._settings, self._writer, self._preview = settings, writer, preview
 
     def add_events(self, events: Events) -> None:
-        """Adds events that lie after those added before."""
+        """Adds events that are later than all events added before."""
         self._writer.add_events(events)
         if self._preview is not None:
             self._preview.add_events(events)
 
     def add_frame(self, frame: Frame, source: Source) -> None:
-        """Adds the next frame, with its depth where the source knows it."""
+        """Adds the next frame, with its depth if the source has depth."""
         depth = source.depth(frame.time) if isinstance(source, RenderedScene | TrainedRun) else None
         shown, seed = self._settings.frame, self._settings.sensor.seed
         sharp = develop(frame.sharp, shown, frame.number, False, seed)

@@ -1,24 +1,24 @@
-"""Events from pictures of brightness: the pixels of an event sensor, ideal but for what its settings say.
+"""Simulates the pixels of an event sensor: makes events from pictures of brightness.
 
-The signal of a pixel is its log brightness, by the sensor's response, linear in time between two pictures. A pixel
-memorises a level of its signal; when the signal has risen above it by the on threshold, or fallen below it by the off
-threshold, the pixel fires and memorises the signal as it then is. That is ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018,
-section 3.1), and every crossing is timed to the nanosecond. The rest is off by default:
+The signal of a pixel is its log brightness, computed by the response of the sensor, and linear in time between two
+pictures. A pixel memorises a level of its signal. When the signal rises above this level by the on threshold, or falls
+below it by the off threshold, the pixel fires an event and memorises the current signal. This is ESIM (Rebecq, Gehrig,
+Scaramuzza, CoRL 2018, section 3.1). Every crossing is timed to the nanosecond. All else is off by default:
 
-* Refractory period: after an event a pixel neither fires nor memorises for that long; then it memorises the signal of
-  that moment (Low, Lee: Robust e-NeRF, ICCV 2023).
-* Finite bandwidth: the signal is log brightness behind a low pass of first order, solved in closed form between two
-  pictures; the cut-off grows with brightness (of the middle between them).
-* Leak: the memorised level falls steadily, so that a pixel that sees nothing change fires on events.
-* Shot noise and hot pixels: events of a Poisson process, of either polarity equally often. They, too, make a pixel
-  memorise its signal and wait for the refractory period.
-* Read-out: jitter of the times, and a bus that carries only so many events.
+* Refractory period: for this time after an event, a pixel neither fires nor memorises. Then it memorises its signal
+  (Low, Lee: Robust e-NeRF, ICCV 2023).
+* Finite bandwidth: the signal is log brightness behind a first-order low pass, solved in closed form between two
+  pictures. The cut-off frequency grows with brightness (in the middle between two pictures).
+* Leak: the memorised level falls steadily, so that a pixel under constant brightness fires on events.
+* Shot noise and hot pixels: events of a Poisson process, on and off equally often. After such an event, too, a pixel
+  memorises its signal and waits for the refractory period.
+* Read-out: jitter of the times, and a bus with a limited rate of events.
 
-Brightness that makes the photoreceptor faster and less noisy, leak and shot noise that resets a pixel are those of
-v2e (Hu, Liu, Delbruck: v2e: From Video Frames to Realistic DVS Events, CVPRW 2021).
+The effect of brightness on bandwidth and noise, the leak, and shot noise that resets a pixel follow v2e (Hu, Liu,
+Delbruck: v2e: From Video Frames to Realistic DVS Events, CVPRW 2021).
 
-Randomness is a function of the seed, the pixel and a running number of its noise or its events, and does not depend on
-threads: events of static scenes are the same however often a picture is given.
+Random numbers depend on the seed, the pixel, and a running number of its noise or its events, but not on threads.
+Events of a static scene do not depend on the number of pictures.
 """
 
 from __future__ import annotations
@@ -38,59 +38,62 @@ from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, 
 from enerf_ns.sensor.response import LINEAR_UNTIL, Gamma, Logarithm, response_named
 
 READOUT_QUEUE = 1000
-"""Events that may wait for the bus; one that comes while so many wait is lost."""
+"""Most events that wait for the bus. Events that come while so many wait are lost."""
 
 SENSOR = 1
-"""Number that draws, with the seed, what is of the sensor; scene and motion are drawn from the seed alone."""
+"""Number that, with the seed, draws the sensor. Scene and motion are drawn from the seed alone."""
 
 CUT_JITTER = 6
-"""Standard deviations at which the jitter of times is cut."""
+"""Largest jitter of a time, in standard deviations."""
 
 TOLERANCE = 1e-9
-"""Log brightness by which a threshold may be missed and still be reached: far above rounding, far below any noise."""
+"""Tolerance of log brightness in reaching a threshold: far above rounding, far below any noise."""
 
 KNEE = math.log(LINEAR_UNTIL)
 """Log brightness up to which linlog is linear."""
 
 NEVER = 2**62
-"""Time (ns) of what never happens."""
+"""Time (ns) of events that never happen."""
 
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What an event sensor is like; by default ideal.
+    """The event sensor; ideal by default.
 
     Raises:
         FlagError: A setting is out of its range.
     """
 
     contrast_thresholds: tyro.conf.Suppress[tuple[float, float]] = (0.25, 0.25)
-    """Change of log brightness that makes an on event, and an off event."""
+    """Contrast thresholds of on events and of off events: the change of log brightness that causes one event."""
     threshold_spread: float = 0.0
-    """Standard deviation of the thresholds from pixel to pixel, as a share of the threshold; they stay as they are."""
+    """Standard deviation of the thresholds between pixels, as a fraction of the threshold. The thresholds are constant
+    in time."""
     refractory_period: int = 0
-    """Nanoseconds that a pixel is deaf for after an event; then it memorises what it sees."""
+    """Refractory period: nanoseconds after an event in which a pixel fires no event. Then it memorises its log
+    brightness."""
     leak_rate: float = 0.0
-    """On events per second of a pixel that sees nothing change; its memory falls by this times its on threshold."""
+    """On events per second of a pixel under constant brightness. Its memorised level falls by this rate times its on
+    threshold."""
     shot_noise_rate: float = 0.0
-    """Noise events per second and pixel; at brightness b, 1 - 0.75 (255 b + 20) / 275 of that: 0.95 in the dark, and a
-    quarter at brightness 1 and above."""
+    """Noise events per second and pixel. At brightness b the rate is multiplied by 1 - 0.75 (255 b + 20) / 275: 0.95 in
+    the dark, 0.25 at brightness 1 and above."""
     hot_pixels: float = 0.0
-    """Share of the pixels that are hot: instead of shot noise they have noise of the hot pixel rate."""
+    """Fraction of pixels that are hot. A hot pixel has noise events at the hot pixel rate instead of shot noise."""
     hot_pixel_rate: float = 1000.0
-    """Noise events per second of a hot pixel, whatever it sees."""
+    """Noise events per second of a hot pixel, at any brightness."""
     cutoff_frequency: float = 0.0
-    """Cut-off frequency of the photoreceptor at brightness 1, in Hz; at brightness b it is (255 b + 20) / 275 of that.
-    0: no low pass."""
+    """Cut-off frequency of the photoreceptor at brightness 1, in Hz. At brightness b it is multiplied by
+    (255 b + 20) / 275. 0 means no low pass."""
     timestamp_jitter: float = 0.0
-    """Standard deviation of the times of events in nanoseconds; they are put in order after that."""
+    """Standard deviation of the times of events, in nanoseconds. Events are sorted afterwards."""
     readout_rate: float = 0.0
-    """Events per second that the bus carries; they wait in a queue for it, and are lost when that is full. 0: all."""
+    """Events per second that the bus carries. Events wait in a queue and are lost if it is full. 0 means no limit."""
     response: str = Logarithm().name
-    """How log brightness comes of brightness: logarithm:OFFSET, which adds the offset to it and takes the logarithm, or
-    linlog, as E-NeRF has it."""
+    """Response that converts brightness to log brightness: logarithm:OFFSET is the logarithm of brightness plus the
+    offset; linlog is the response of E-NeRF."""
     seed: int = 0
-    """Seed that draws all that is random."""
+    """Seed of all random numbers: scene, motion, and noise."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -106,8 +109,8 @@ class SensorSettings:
                     raise FlagError(f"--response names {error}") from error
                 if isinstance(response, Gamma):
                     raise FlagError(
-                        f"--response is {value}, but a sensor answers linear brightness, which is not gamma-encoded; "
-                        f"give logarithm:{response.offset!r}, which is the same of it."
+                        f"--response is {value}, but a sensor sees linear brightness, which is not gamma-encoded; "
+                        f"give logarithm:{response.offset!r}, which is the same for linear brightness."
                     )
                 continue
             elif field.name == "hot_pixels":
@@ -130,48 +133,51 @@ class PartialPicture(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """What every pixel is and remembers. Levels are signal plus leak: the memory stays and the signal rises instead."""
+    """Constants and state of every pixel.
+
+    Levels are signal plus leak: in place of a memorised level that falls, the signal rises.
+    """
 
     on: np.ndarray
     off: np.ndarray
     leak: np.ndarray
-    """By how much leak raises each pixel's level, per nanosecond."""
+    """Rise of each pixel's level by leak, per nanosecond."""
     noise_rate: np.ndarray
-    """Noise events of each pixel per nanosecond, of which brightness keeps a share."""
+    """Noise events of each pixel per nanosecond, before brightness thins them out."""
     hot: np.ndarray
     signal: np.ndarray
     """Signal of each pixel at the time of the last picture, without leak."""
     memorised: np.ndarray
     rises: np.ndarray
     falls: np.ndarray
-    """Off thresholds, as `rises` are on thresholds, passed since `memorised`; the memory is now `memorised + rises * on
-    - falls * off`, without adding up errors."""
+    """Number of off thresholds passed since `memorised`; `rises` counts on thresholds. The memorised level is now
+    `memorised + rises * on - falls * off`, so that rounding errors do not add up."""
     upper: np.ndarray
     lower: np.ndarray
-    """Level of each pixel's next off event, as `upper` is that of its next on event."""
+    """Level of each pixel's next off event; `upper` is the level of its next on event."""
     awake: np.ndarray
-    """Time (ns) until which each pixel is deaf, and at which it then memorises."""
+    """End (ns) of each pixel's refractory period, at which it memorises its signal."""
     noise: np.ndarray
-    """Time (ns) when noise may come next to each pixel."""
+    """Time (ns) of each pixel's next possible noise event."""
     num_noise: np.ndarray
     num_events: np.ndarray
 
 
 class EventSensor:
-    """The pixels of an event sensor, and what each of them memorised.
+    """The pixels of an event sensor with their memorised levels.
 
     Args:
-        settings: what the sensor is like.
-        brightness: [H, W], linear, at least 0, 1 for what frames show as white and no upper limit; the picture that
-            all pixels memorise at the start. Of a sensor with colour filters, each pixel's own channel.
-        time: of that picture, int nanoseconds.
+        settings: Settings of the sensor.
+        brightness: Picture [H, W] that all pixels memorise at the start: linear, at least 0, without an upper limit; 1
+            is white in frames. For a sensor with colour filters, the channel of each pixel.
+        time: Time of this picture, nanoseconds.
 
     Attributes:
-        contrast_thresholds: float64 [2, H, W], every pixel's own, on and off.
-        hot_pixels: int64 [N], their pixel numbers (y * width + x), in order.
+        contrast_thresholds: On and off threshold of each pixel, float64 [2, H, W].
+        hot_pixels: Numbers (y * width + x) of the hot pixels, int64 [N], in increasing order.
 
     Raises:
-        FlagError: The spread of the thresholds leaves pixels without a threshold.
+        FlagError: `threshold_spread` leaves pixels without a valid threshold.
         RecordingError: The picture has a value that is negative or not finite.
     """
 
@@ -219,26 +225,27 @@ class EventSensor:
         _first_noise(self._pixels, self._keys)
         self._held = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int8)
         self._bus_free = 0.0
-        """When the bus has carried all that came before, nanoseconds since the start."""
+        """Time at which the bus has carried all earlier events, nanoseconds since the start."""
 
     def advance(
         self, brightness: Float[np.ndarray, "height width"], time: int, before: Sequence[PartialPicture] = ()
     ) -> Events:
         """Events from the last picture to this one.
 
-        Jitter and a slow bus hold events back; they come with a later call, or from `finish`.
+        Jitter and a slow bus hold events back. A later call or `finish` returns them.
 
         Args:
-            brightness: [H, W], as `EventSensor` takes that of the first picture.
-            time: int nanoseconds, later than that of the last picture.
-            before: what some of the pixels saw between the last picture and this one, later one by one.
+            brightness: Picture [H, W], as for `EventSensor`.
+            time: Time of the picture in nanoseconds, later than the last picture.
+            before: Brightness of some pixels between the last picture and this one, in order of time.
 
         Returns:
-            Events in the order of their times, and after those of the last call: after the last picture (rounded up to
-            the nanosecond) and not after this one. Events of the same time are in the order of pixels.
+            Events in order of time, later than the events of the last call. Their times, rounded up to the nanosecond,
+            are after the last picture and not after this one. Events of the same time are in order of pixels.
 
         Raises:
-            RecordingError: The picture is of another size, not later, or has a value that is negative or not finite.
+            RecordingError: The picture has another size, is not later than the last one, or has a value that is
+                negative or not finite.
         """
         time = int(time)
         if brightness.shape != (self.height, self.width):
@@ -264,7 +271,7 @@ class EventSensor:
     def _see(
         self, pixels: np.ndarray, since: np.ndarray, brightness: np.ndarray, time: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Events of some pixels from when they were seen last, which becomes this time."""
+        """Pixels, times and polarities of the events of some pixels since they were seen last."""
         settings = self.settings
         now = self._respond(brightness, pixels, time)
         offset = self._response.offset if isinstance(self._response, Logarithm) else math.nan
@@ -275,13 +282,16 @@ class EventSensor:
         )  # fmt: skip
 
     def finish(self) -> Events:
-        """The events that were held back, if any. The times of those that would come after the last picture are cut to
-        it, and what still waits for the bus then is lost."""
+        """The events that were held back.
+
+        Times after the last picture are set to its time. Events that still wait for the bus then are lost.
+        """
         pixel, times, polarity = self._held
         return self._read_out(pixel, np.minimum(times, self.time), polarity, self.time)
 
     def _read_out(self, pixel: np.ndarray, times: np.ndarray, polarity: np.ndarray, settled: int) -> Events:
-        """Events that no later one can come before, in the order of time; holds the others back."""
+        """Events up to the time `settled`, which no later event can precede, in order of time; holds the others
+        back."""
         order = np.lexsort((pixel, times))
         pixel, times, polarity = pixel[order], times[order], polarity[order]
         count = int(np.searchsorted(times, settled, "right"))
@@ -314,11 +324,11 @@ class EventSensor:
 def _fire(  # pragma: no cover
     pixels, keys, which, seen, now, first, since, end, offset, cutoff, refractory_period, jitter
 ):
-    """Pixels, times and polarities of events from when each of some pixels was last `seen`, `since`, up to `end`.
+    """Pixels, times and polarities of the events of the pixels `which`, in their order, up to the time `end`.
 
-    They are in the order of `which`. Moves these pixels on to `end`, when they see `now`. Within the interval, times
-    are nanoseconds since its start: `s` is when a pixel's memory was last moved, `awake` and `noise` as in `_Pixels`.
-    `offset` as of `_brightness`.
+    Each pixel had the log brightness `seen` at the time `since` and has `now` at `end`; its state is advanced to `end`.
+    In the loop, times are nanoseconds since `since`: `s` is the last change of the memorised level, `awake` and `noise`
+    are those of `_Pixels`. For `offset` see `_brightness`.
     """
     count = 0
     pixel, times, polarity = np.empty(4096, np.int64), np.empty(4096, np.int64), np.empty(4096, np.int8)
@@ -394,7 +404,7 @@ def _fire(  # pragma: no cover
 
 @compiled
 def _brightness(level, offset):  # pragma: no cover
-    """Compiled twin of `Response.inverse` for one number: of `Logarithm` or, where the offset is nan, of `Linlog`."""
+    """Compiled twin of `Logarithm.inverse` for one number, or of `Linlog.inverse` if the offset is nan."""
     if not np.isnan(offset):
         return np.exp(level) - offset
     return (level * (LINEAR_UNTIL / KNEE) if level < KNEE else np.exp(level)) / 255
@@ -402,10 +412,10 @@ def _brightness(level, offset):  # pragma: no cover
 
 @compiled
 def _level(curve, s):  # pragma: no cover
-    """Level of a curve at time s: the low pass of a line, plus leak.
+    """Level of a curve at time s: a line behind a low pass, plus leak.
 
-    A curve is, at its start: the level, how far the input is above the output, the slopes of input and of leak, and the
-    angular frequency of the low pass (0: there is none, output is input).
+    A curve has five numbers: the level at its start, the input minus the output at its start, the slope of the input,
+    the slope of the leak, and the angular frequency of the low pass (0 for no low pass).
     """
     level, pull, slope, leak, decay = curve
     if decay == 0:
@@ -416,7 +426,7 @@ def _level(curve, s):  # pragma: no cover
 
 @compiled
 def _turn(curve):  # pragma: no cover
-    """When the level of a curve is highest or lowest; infinity if it always rises or always falls."""
+    """Time at which the level of a curve is highest or lowest; infinity if it only rises or only falls."""
     _, pull, slope, leak, decay = curve
     remaining = (slope + leak) / (slope - pull * decay)
     return -np.log(remaining) / decay if decay > 0 and 0 < remaining < 1 else np.inf
@@ -424,7 +434,7 @@ def _turn(curve):  # pragma: no cover
 
 @compiled
 def _next_crossing(curve, turn, s, stop, lower, upper):  # pragma: no cover
-    """First time from s to stop that the level reaches upper (+1) or lower (-1); else 0 and s."""
+    """+1 or -1 and the first time from s to stop at which the level reaches upper or lower; else 0 and s."""
     since = s
     for until in (turn, stop):
         if not since <= until <= stop:
@@ -440,9 +450,9 @@ def _next_crossing(curve, turn, s, stop, lower, upper):  # pragma: no cover
 
 @compiled
 def _reached(curve, wanted, low, high):  # pragma: no cover
-    """When a level that only rises, or only falls, from low to high reaches the one wanted.
+    """Time between low and high at which a level that only rises, or only falls, reaches the wanted level.
 
-    With a low pass by Newton's method, and by bisection where that leaves the bracket.
+    With a low pass it is found by Newton's method, with a bisection where Newton's method leaves the bracket.
     """
     level, pull, slope, leak, decay = curve
     if decay == 0:
@@ -473,7 +483,7 @@ def _longer(values):  # pragma: no cover
 
 @compiled
 def _random(key, pixel, number):  # pragma: no cover
-    """64 random bits: place `pixel * 2^32 + number` of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
+    """64 random bits: number `pixel * 2^32 + number` of the sequence SplitMix64 (Steele, Lea, Flood, OOPSLA 2014)."""
     place = (np.uint64(pixel) << np.uint64(32)) + np.uint64(number)
     bits = key + (place + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -489,7 +499,7 @@ def _uniform(bits):  # pragma: no cover
 
 @compiled
 def _normal(keys, pixel, number):  # pragma: no cover
-    """Normal random number by Box and Muller's method, cut at `CUT_JITTER`."""
+    """Normal random number by Box and Muller's method, clipped to `CUT_JITTER`."""
     radius = np.sqrt(-2 * np.log(_uniform(_random(keys[2], pixel, number))))
     return min(max(radius * np.cos(2 * np.pi * _uniform(_random(keys[3], pixel, number))), -CUT_JITTER), CUT_JITTER)
 
@@ -511,17 +521,16 @@ def _first_noise(pixels, keys):  # pragma: no cover
 
 @compiled
 def _transmit(times, first, end, free, rate):  # pragma: no cover
-    """When the bus has carried each event, nanoseconds, and `first - 1` for those that are lost; ends with the last
-    that it carries before `end`.
+    """Times (ns) at which the bus has carried events, up to the last event that it carries before `end`.
 
     Args:
-        times: int64 [N] nanoseconds, when they come, in order.
-        free: when the bus has carried all before them, since `first`.
-        rate: of the bus, events per nanosecond.
+        times: Times at which the events come, int64 [N], in order.
+        first: Start of the recording, ns.
+        free: Time at which the bus has carried all earlier events, ns since `first`.
+        rate: Rate of the bus, events per nanosecond.
 
     Returns:
-        departures: int64 [M], M <= N.
-        free: after them.
+        The times, int64 [M] with M <= N, `first - 1` for lost events; and the new value of `free`.
     """
     departures = np.empty(len(times), np.int64)
     for i in range(len(times)):

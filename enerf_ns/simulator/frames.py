@@ -1,4 +1,4 @@
-"""Frames of a simulated camera: sharp and blurred by motion, and the 8 bits that its sensor makes of them."""
+"""Frames of a simulated camera: sharp frames, motion-blurred frames, and their 8-bit grey levels."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from jaxtyping import Float, Int64, UInt8
 from enerf_ns.dataparsers.recording.errors import FlagError
 
 MOST_LEVEL = 1e6
-"""Brightness, as a multiple of what is white, above which pixels have the noise of this brightness."""
+"""Brightness, in multiples of the saturation, above which shot noise no longer grows."""
 
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """The sensor of the frames.
+    """The frame sensor.
 
     Raises:
         FlagError: A setting is out of its range.
     """
 
     saturation: float = 1.0
-    """Brightness, above 0, from which on pixels are white."""
+    """Brightness, above 0, from which on pixels are white (255)."""
     read_noise: float = 0.0
-    """Standard deviation of the noise of reading out, in grey levels, of which there are 255."""
+    """Standard deviation of the read noise, in grey levels of 255."""
     shot_noise: float = 0.0
-    """Electrons in a pixel that is white, its full well: the fewer, the more noise; 0 for no noise."""
+    """Full well of a pixel, the number of electrons of a white pixel. Fewer electrons mean more noise; 0 means no
+    noise."""
     hdr: bool = False
-    """Keep the linear brightness of frames as well, without noise and saturation."""
+    """Write the linear brightness of frames too, without noise and saturation."""
 
     def __post_init__(self) -> None:
         for name, value, least, what in (
@@ -42,7 +43,7 @@ class FrameSettings:
 
 @dataclass(frozen=True)
 class Frame:
-    """What falls on the sensor: linear brightness, in colour R G B."""
+    """Linear brightness on the frame sensor, grey or R G B."""
 
     number: int
     """Number of the frame, from 0."""
@@ -51,18 +52,18 @@ class Frame:
     sharp: Float[np.ndarray, "height width *channels"]
     """Brightness at the time of the frame."""
     blurred: Float[np.ndarray, "height width *channels"] | None
-    """Mean brightness over the exposure; None if the exposure is 0."""
+    """Mean brightness during the exposure; None if the exposure is 0."""
 
 
 class Exposures:
-    """Frames from pictures at the times of their exposures.
+    """Makes frames from the pictures rendered during their exposures.
 
-    Brightness is taken to change linearly from one picture to the next, as between events, so that the integral over
-    the exposure is a sum of trapezoids.
+    Brightness is taken to change linearly from one picture to the next, so that the integral over the exposure is a sum
+    of trapezoids.
 
     Args:
-        times: Of the frames (ns), increasing: the middles of their exposures.
-        exposure: How long each lasts (ns); 0 for sharp frames alone.
+        times: Times of the frames (ns), increasing: the middles of their exposures.
+        exposure: Duration of each exposure (ns); 0 for sharp frames only.
 
     Raises:
         FlagError: The exposure is negative, or longer than from one frame to the next.
@@ -84,21 +85,21 @@ class Exposures:
 
     @property
     def stops(self) -> Int64[np.ndarray, " stops"]:
-        """Times (ns, increasing) at which there must be pictures: exposures begin, are half over, and end."""
+        """Times (ns, increasing) at which pictures are needed: beginning, middle and end of each exposure."""
         return np.unique(np.concatenate([self.opens, self.times, self.closes]))
 
     def add(self, time: int, brightness: Float[np.ndarray, "height width *channels"]) -> Frame | None:
-        """Takes the next picture; outside exposures there need be none.
+        """Adds the next picture; outside exposures no picture is needed.
 
         Args:
-            time: ns, later than that of the picture before.
-            brightness: Linear, from 0 on; not changed afterwards.
+            time: Time of the picture, ns, later than the picture before.
+            brightness: Linear, at least 0. The caller must not change it afterwards.
 
         Returns:
-            the frame whose exposure ends now, if one does.
+            The frame whose exposure ends at this time, if there is one.
 
         Raises:
-            ValueError: There was no picture when its exposure began or was half over, or there is none at its end.
+            ValueError: There is no picture at the beginning, middle or end of the exposure.
         """
         number = self._number
         if number == len(self.times):
@@ -138,17 +139,17 @@ def develop(
     blurred: bool,
     seed: int = 0,
 ) -> UInt8[np.ndarray, "height width *channels"]:
-    """The grey levels that the sensor reads out: 255 from the saturation on, rounded to the nearest.
+    """The grey levels of a frame, rounded; 255 from the saturation on.
 
-    The electrons in a pixel are Poisson distributed about its share of the full well, and reading them out adds a
-    Gaussian error to the level.
+    The electrons of a pixel are Poisson distributed around its fraction of the full well. The read-out adds a Gaussian
+    error.
 
     Args:
-        brightness: Linear, from 0 on.
-        settings: Of the sensor.
-        number: Of the frame, from 0.
-        blurred: Whether it is the blurred or the sharp frame of this number.
-        seed: Draws the noise, together with the number and `blurred`; from 0 on.
+        brightness: Linear, at least 0.
+        settings: Settings of the frame sensor.
+        number: Number of the frame, from 0.
+        blurred: Whether this is the blurred or the sharp frame of this number.
+        seed: Seed of the noise, together with `number` and `blurred`; at least 0.
     """
     rng = np.random.default_rng([seed, number, int(blurred)])
     level = np.asarray(brightness, np.float64) / settings.saturation

@@ -1,7 +1,8 @@
-"""The five simulated sequences of the E-NeRF paper (Klenk et al., RA-L 2023), made again: `enerf simulate spiral1`.
+"""Presets for the five simulated sequences of the E-NeRF paper (Klenk et al., RA-L 2023), as `enerf simulate spiral1`.
 
-Scene, motion, kind of blur, size and number of frames are the paper's; what it does not tell, such as speed, exposure
-and field of view, is chosen here, so that the presets of `ns-train` with these names fit what is simulated.
+Scene, motion, strength of blur, size and number of frames follow the paper. The paper does not state speed, exposure
+and field of view; they are chosen here so that the presets of `ns-train` with the same names suit the simulated
+sequences. `USUAL` has the values for all other scenes.
 """
 
 from __future__ import annotations
@@ -17,22 +18,22 @@ from enerf_ns.simulator.trajectories import MOTIONS
 
 @dataclass(frozen=True)
 class SimulationPreset:
-    """How one sequence is simulated."""
+    """Values of settings that are left out."""
 
-    scene: Literal["roads", "moon"]
-    """Name of the scene in `scenes.SCENES`."""
+    scene: Literal["roads", "moon"] | None
+    """Name of the scene in `scenes.SCENES`; None for any other scene."""
     motion: Literal["shake", "spiral"]
-    """Motion of the camera: forward-facing with abrupt turns, or inward."""
-    turns_per_second: float
-    """How often a shaking camera turns back, or how often a camera goes round its target."""
+    """Motion of the camera: forward-facing with abrupt turns, or an inward spiral."""
+    turns_per_second: float | None
+    """Reversals per second of a shaking camera, or rounds per second of a spiral; None for the motion's default."""
     num_frames: int
-    """Number of frames: as many as the paper's configs select from."""
+    """Number of frames, as in the configs of the paper."""
     duration: float
-    """Length of the recording, seconds."""
+    """Duration of the recording, seconds."""
     exposure_ms: float
     """Exposure of the blurred frames, milliseconds."""
     blur: float
-    """How far the picture moves during an exposure: pixels, mean over the picture, the frames and many seeds."""
+    """Motion of the picture during an exposure, pixels: mean over pixels, frames and many seeds; nan if unknown."""
     width: int = 640
     """Width of events and frames, pixels."""
     height: int = 480
@@ -40,12 +41,12 @@ class SimulationPreset:
     field_of_view: float = 60.0
     """Horizontal field of view, degrees."""
     contrast_thresholds: tuple[float, float] = (0.2, 0.2)
-    """Contrast thresholds that the paper learns with, of on and of off events."""
+    """Contrast thresholds of on and off events that the paper trains with."""
 
     def trajectory(self, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> Trajectory:
-        """The motion of this preset before a scene; arguments as of `trajectories.shake`."""
-        duration = round(self.duration * 1e9)
-        return MOTIONS[self.motion](duration, camera, target, rng, self.turns_per_second)
+        """The trajectory of this preset; for the arguments see `trajectories.shake`."""
+        turns = () if self.turns_per_second is None else (self.turns_per_second,)
+        return MOTIONS[self.motion](round(self.duration * 1e9), camera, target, rng, *turns)
 
 
 PRESETS = {
@@ -57,5 +58,9 @@ PRESETS = {
         "roads", "shake", 6.0, num_frames=41, duration=1.025, exposure_ms=22.0, blur=20.0
     ),
 }
-"""Sequences by name: with mild blur (spiral1, spiral2, shake-moon1), medium (shake-moon2) and strong
-(shake-carpet1)."""
+"""Presets by name. Blur is mild (spiral1, spiral2, shake-moon1), medium (shake-moon2) or strong (shake-carpet1)."""
+
+USUAL = SimulationPreset(
+    None, "shake", None, num_frames=41, duration=1.0, exposure_ms=20.0, blur=float("nan"), width=160, height=120
+)
+"""Values for all other scenes."""

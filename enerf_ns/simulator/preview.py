@@ -1,4 +1,4 @@
-"""A video of what is simulated: frame, blurred frame, events and depth, side by side."""
+"""Preview video of a simulation: frame, blurred frame, events and depth, side by side."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from enerf_ns.dataparsers.recording.files import in_colour, partial_of
 from enerf_ns.dataparsers.recording.recording import Events
 
 OFF_COLOUR, NO_COLOUR, ON_COLOUR = (50, 70, 205), (255, 255, 255), (205, 50, 50)
-"""Colours (R G B) of pixels whose latest event was off, that had none, and whose latest was on."""
+"""Colours (R G B) of pixels whose latest event is an off event, of pixels without events, and of pixels whose latest
+event is an on event."""
 
 
 class Preview:
-    """Writes one picture of the video for each frame of the recording, to be used in a `with` statement.
+    """Writes one picture of the video for each frame of the recording; to be used in a `with` statement.
 
-    From left to right: the sharp frame; the blurred one, if there is; the latest event of each pixel since the frame
-    before; inverse depth from near (red) to far (blue), where there is depth, black where nothing is. All are as high
-    as the frames.
+    From left to right: the sharp frame; the blurred frame, if there is one; the latest event of each pixel since the
+    frame before; inverse depth, if there is depth, from near (red) to far (blue), and black where no surface is seen.
+    All have the height of the frames. The video plays at 10 frames per second.
 
     Args:
-        path: New .mp4 file, which is there once the block ends, and whole.
-        width, height: Of the event camera, pixels.
-        frames_per_second: At which the video plays.
+        path: New .mp4 file. It appears, whole, when the block ends.
+        width, height: Size of the event camera, pixels.
     """
 
-    def __init__(self, path: Path, width: int, height: int, frames_per_second: int = 10):
-        self.path, self.frames_per_second = path, frames_per_second
+    def __init__(self, path: Path, width: int, height: int):
+        self.path = path
         self._partial = partial_of(path)
         self._events = np.full((height, width, 3), NO_COLOUR, np.uint8)
         self._inverse_depths: tuple[float, float] | None = None
         self._video = None
 
     def add_events(self, events: Events) -> None:
-        """Adds events that lie after those added before."""
+        """Adds events that are later than all events added before."""
         self._events[events.y, events.x] = np.where((events.p > 0)[:, None], ON_COLOUR, OFF_COLOUR)
 
     def add_frame(
@@ -46,11 +46,13 @@ class Preview:
         blurred: UInt8[np.ndarray, "height width *channels"] | None,
         depth: Float[np.ndarray, "height width"] | None,
     ) -> None:
-        """Adds a picture with the events since the frame before; every frame has the same kinds of pictures.
+        """Adds a picture with the events since the frame before.
+
+        Every frame must have the same of `blurred` and `depth`.
 
         Args:
-            sharp, blurred: Of the frame camera, in grey or R G B.
-            depth: Metres, 0 where nothing is.
+            sharp, blurred: Pictures of the frame camera, grey or R G B.
+            depth: Metres, 0 where no surface is seen.
 
         Raises:
             OutputError: The video cannot be written.
@@ -61,7 +63,7 @@ class Preview:
         panels = [in_colour(sharp), None if blurred is None else in_colour(blurred), events]
         panels.append(None if depth is None else self._colour_depth(depth))
         picture = np.concatenate([panel for panel in panels if panel is not None], axis=1)
-        odd_height, odd_width = height % 2, picture.shape[1] % 2  # of which the video's format can hold none
+        odd_height, odd_width = height % 2, picture.shape[1] % 2  # since the format of the video needs even sizes
         picture = np.pad(picture, ((0, odd_height), (0, odd_width), (0, 0)), mode="edge")
         try:
             if self._video is None:
@@ -93,7 +95,7 @@ class Preview:
         video = write_frames(
             str(self._partial),
             (width, height),
-            fps=self.frames_per_second,
+            fps=10,
             codec="libx264",
             quality=7,
             macro_block_size=2,
@@ -103,7 +105,7 @@ class Preview:
         return video
 
     def _colour_depth(self, depth: np.ndarray) -> np.ndarray:
-        """Depth in colours, on the scale of the first frame with depth."""
+        """Inverse depth in colours, scaled to the range of the first frame with depth."""
         seen = depth > 0
         inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=seen)
         if self._inverse_depths is None and seen.any():

@@ -1,4 +1,4 @@
-"""When to render, so that what lies between two pictures is known well enough to make events of it."""
+"""Times of rendering, dense enough that events can be interpolated between two pictures."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from enerf_ns.sensor.response import Logarithm, Response
 from enerf_ns.simulator.event_sensor import PartialPicture
 
 MOTION_STEP = 1_000_000
-"""Nanoseconds from one to the next of the poses between which displacements are measured."""
+"""Nanoseconds between the poses at which displacements are measured."""
 
 STEPS_PER_DEPTH = 5
-"""Number of steps of `MOTION_STEP` for which the points that the camera sees in their middle are followed."""
+"""Number of steps of `MOTION_STEP` for each depth image, which is rendered in the middle of them."""
 
 GRID = 64
-"""Points that are followed, across and down the picture, or every pixel where it has fewer; each as near as the nearest
-thing seen between it and the next."""
+"""Number of points along each axis of the picture whose displacement is measured; every pixel in a smaller picture.
+Each point takes the smallest depth of the pixels from it to the next point."""
 
 MAX_DISPLACEMENT = 0.5
-"""Most pixels that a point may move from one picture to the next."""
+"""Largest motion of a point from one picture to the next, pixels."""
 
 MAX_CHANGE = 0.3
-"""Most that log brightness may change from one time at which a pixel is rendered to the next."""
+"""Largest change of log brightness of a pixel from one time of rendering to the next."""
 
 MOST_HALVINGS = 3
-"""How many times an interval is halved at most. A pixel is the mean of 16 samples, so that an edge passes it in as many
-steps: from half a pixel of motion between pictures three halvings lead to that of one step, and more would show the
-steps alone."""
+"""Most halvings of an interval. A pixel is the mean of 16 samples, so that an edge passes it in 16 steps. Three
+halvings of half a pixel of motion lead to one such step; more halvings would only resolve the steps."""
 
 
 class Render(NamedTuple):
@@ -46,7 +45,7 @@ class Render(NamedTuple):
     brightness: Float[np.ndarray, "height width *channels"]
     """Linear brightness of all pixels."""
     before: list[PartialPicture]
-    """Pixels whose brightness was needed between the last picture and this one, in the order of time."""
+    """Pixels rendered between the last picture and this one, in order of time."""
 
 
 def render_times(
@@ -57,18 +56,18 @@ def render_times(
     max_displacement: float = MAX_DISPLACEMENT,
     threads: int | None = None,
 ) -> Int64[np.ndarray, " times"]:
-    """Times of rendering, so close that no point of the scene moves further than `max_displacement` in between.
+    """Times of rendering between which no point of the scene moves further than `max_displacement`.
 
-    Adds up, from millisecond to millisecond, the displacement of the point that moves most, of a grid over the picture
-    with the nearest depth around each, and divides the sum evenly between two stops. Depth is looked at every 5 ms.
+    The displacement of the fastest point of a grid over the picture is added up from millisecond to millisecond. The
+    sum is divided evenly between two stops. Depth is rendered every 5 ms.
 
     Args:
-        camera: That moves.
-        trajectory: Of the camera; covers the stops.
-        depth: z-depth that the camera sees at a time (ns), 0 where it sees nothing. Called from several threads.
-        stops: Nanoseconds, strictly increasing; times to render at in any case.
+        camera: Camera that moves.
+        trajectory: Trajectory of the camera; covers the stops.
+        depth: z-depth at a time (ns), 0 where no surface is seen. Called from several threads.
+        stops: Times that must be among the times of rendering, ns, strictly increasing.
         max_displacement: Pixels.
-        threads: How many measure displacements. None: as many as PyTorch uses.
+        threads: Number of threads. Default: as many as PyTorch uses.
 
     Returns:
         Nanoseconds, strictly increasing, from the first stop to the last, all stops among them.
@@ -117,27 +116,27 @@ def adaptive_renders(
     response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
     threads: int | None = None,
 ) -> Iterator[Render]:
-    """Pictures at the given times, and between them the pixels of which they do not tell enough.
+    """Pictures at the given times, and between them the pixels that change too much to be interpolated.
 
-    Between two times at which a pixel is rendered its log brightness should differ by no more than `max_change`, and
-    stray by no more than an eighth of the square of that from the straight line that events are made from: by 0.011 for
-    0.3. So far strays the logarithm of a brightness that changes linearly by `max_change`; of others the error is
-    estimated by second differences, which also tell where a pixel becomes darker and brighter again. Where either is
-    more, the interval is halved, but at most `MOST_HALVINGS` times. The first and the last interval have a picture on
-    one side alone to take second differences with.
+    Events are made from log brightness that is linear between two times of rendering. So log brightness of a pixel
+    should change by at most `max_change` between them, and deviate from the line by at most `max_change**2 / 8`: 0.011
+    for 0.3. That is the deviation of the logarithm of a brightness that changes linearly by `max_change`. The deviation
+    is estimated from second differences, which also find pixels that become darker and brighter again. An interval in
+    which a pixel exceeds either limit is halved for this pixel, at most `MOST_HALVINGS` times. The first and the last
+    interval have only one second difference.
 
-    What is rendered depends on brightness alone. A few pictures are rendered ahead; an exception of a render is raised
-    instead of its picture or of the one before, to which it is a neighbour.
+    The result depends on brightness only, not on threads. A few pictures are rendered ahead. An exception of a render
+    is raised in place of its picture or of the picture before.
 
     Args:
-        brightness: As of `sources.Source`. Called from several threads.
-        times: Nanoseconds, strictly increasing; whole pictures are rendered at these and no others.
-        max_change: Of log brightness; infinite: nothing is rendered between pictures.
-        response: How log brightness comes of brightness.
-        threads: How many render at once. None: as many as PyTorch uses.
+        brightness: Function like `sources.Source.brightness`. Called from several threads.
+        times: Times of the whole pictures, ns, strictly increasing.
+        max_change: Change of log brightness. If it is infinite, nothing is rendered between pictures.
+        response: Response that converts brightness to log brightness.
+        threads: Number of threads that render. Default: as many as PyTorch uses.
 
     Yields:
-        In the order of time.
+        Pictures in order of time.
     """
     threads = threads or torch.get_num_threads()
     max_error = max_change**2 / 8
@@ -148,7 +147,7 @@ def adaptive_renders(
     def submit(index: int) -> None:
         if index < len(times):
             pictures[index] = pool.submit(brightness, int(times[index]), None)
-        earlier = index - threads - 1  # so that no thread waits for a picture that no other one has begun with
+        earlier = index - threads - 1  # by then a thread has begun every picture that `halve` waits for
         if 0 < earlier < len(times):
             partial_pictures[earlier] = pool.submit(halve, earlier)
 
@@ -170,8 +169,8 @@ def adaptive_renders(
     def between(
         start: int, end: int, pixels: np.ndarray, before: np.ndarray, after: np.ndarray, error: np.ndarray, halvings=0
     ) -> list[PartialPicture]:
-        """The partial pictures in an interval of some pixels, from their log brightness before and after it, and by how
-        much it may stray from a line."""
+        """The partial pictures of some pixels in an interval, from their log brightness before and after the interval,
+        and the estimated deviation from a line."""
         wrong = ((np.abs(after - before) > max_change) | (error > max_error)).any(axis=1)
         middle = (start + end) // 2
         if halvings == MOST_HALVINGS or middle == start or not wrong.any():
@@ -200,7 +199,7 @@ def adaptive_renders(
 
 
 def _bend(times: np.ndarray, levels: list[np.ndarray]) -> np.ndarray:
-    """Magnitude of the second derivative of what has these three levels at these times."""
+    """Magnitude of the second derivative of a curve with three levels at three times."""
     first, second = times[1] - times[0], times[2] - times[1]
     slopes = (levels[2] - levels[1]) / second - (levels[1] - levels[0]) / first
     return np.abs(slopes) * (2 / (first + second))

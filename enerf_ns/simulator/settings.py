@@ -1,4 +1,4 @@
-"""What is simulated, and how: the settings of `engine.simulate`, which are the flags of `enerf simulate`."""
+"""The settings of `engine.simulate`, which are the flags of `enerf simulate`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.files import expanded
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.frames import FrameSettings
-from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
+from enerf_ns.simulator.paper_sequences import PRESETS, USUAL, SimulationPreset
 from enerf_ns.simulator.sampling import MAX_CHANGE, MAX_DISPLACEMENT
 from enerf_ns.simulator.scene.scenes import SCENES
 
@@ -27,70 +27,74 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What is seen, how the camera moves, and what the sensors of events and of frames are like.
+    """Scene, motion of the camera, event sensor and frame sensor of a simulation.
 
-    Settings that contradict one another are refused where they are used, by `resolve`.
+    `resolve` refuses settings that contradict one another.
     """
 
     scene: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
-    """What is seen: a preset (spiral1, spiral2, shake-moon1, shake-moon2, shake-carpet1), a scene (shapes, carpet,
-    roads, moon, board), a mesh (.glb, .gltf, .obj, .ply, .stl), a scene file (.json), a folder of images, a video."""
+    """Scene to simulate: a preset (spiral1, spiral2, shake-moon1, shake-moon2, shake-carpet1), a scene (shapes,
+    carpet, roads, moon, board), a mesh file (.glb, .gltf, .obj, .ply, .stl), a folder of images, or a video."""
     from_run: Optional[Path] = None  # noqa: UP045
-    """config.yml of a run of Nerfstudio, which is rendered instead of a scene."""
+    """config.yml of a Nerfstudio run, which the simulator renders instead of a scene."""
     motion: Optional[Literal["shake", "spiral"]] = None  # noqa: UP045
-    """How the camera moves: forward-facing with abrupt turns, or an inward spiral. None: as the preset, or shake."""
+    """Motion of the camera: forward-facing with abrupt turns (shake), or an inward spiral. Default: that of the preset,
+    else shake."""
     key_frames: Optional[Path] = None  # noqa: UP045
-    """Text file of the camera's places and targets, used instead of a motion, `t x y z tx ty tz` a line: seconds,
-    metres, z up."""
+    """Text file of positions of the camera and of its target, used instead of a motion. Each line is `t x y z tx ty
+    tz`: seconds, metres, z up."""
     trajectory: Optional[Path] = None  # noqa: UP045
-    """Recording, or text file of poses, `t px py pz qx qy qz qw` a line, whose motion is used instead of shake or
-    spiral."""
+    """Recording or text file of poses whose trajectory is used instead of a motion. Each line of a text file is
+    `t px py pz qx qy qz qw`: camera to world, metres, OpenCV axes."""
     trajectory_unit: Literal["s", "us", "ns"] = "s"
-    """Unit of the times of a file of poses."""
+    """Unit of the times in the text file of poses."""
     duration: Optional[float] = None  # noqa: UP045
-    """Length of the recording in seconds. None: that of the preset, the trajectory or the video, or 1."""
+    """Duration of the recording in seconds. Default: that of the preset, the trajectory or the video, else 1."""
     num_frames: Optional[int] = None  # noqa: UP045
-    """Number of frames, at regular times. None: as many a second as the preset, or 41."""
+    """Number of frames, at regular times. Default: the frame rate of the preset, else 41 frames per second."""
     exposure_ms: Optional[float] = None  # noqa: UP045
-    """Exposure of the blurred frames in milliseconds, centred at the time of the frame; 0: none are made. None: as the
-    preset, or 20, but no longer than from one frame to the next."""
+    """Exposure of the blurred frames in milliseconds, centred at the time of the frame. 0 makes no blurred frames.
+    Default: that of the preset, else 20, but at most the time from one frame to the next."""
     width: Optional[int] = None  # noqa: UP045
-    """Width of events and frames, in pixels. None: as the preset or the run, or 160; in proportion, if height is
-    given."""
+    """Width of events and frames in pixels. Default: that of the preset or the run, else 160; if only the height is
+    given, the width in proportion to it."""
     height: Optional[int] = None  # noqa: UP045
-    """Height of events and frames, in pixels. None: as the preset or the run, or 120; in proportion, if width is
-    given."""
+    """Height of events and frames in pixels. Default: that of the preset or the run, else 120; if only the width is
+    given, the height in proportion to it."""
     field_of_view: Optional[float] = None  # noqa: UP045
-    """Horizontal field of view, in degrees. None: as the preset or the run, or 60."""
+    """Horizontal field of view in degrees. Default: that of the preset or the run, else 60."""
     cameras: Optional[Path] = None  # noqa: UP045
-    """JSON file with `camera` and, if another one takes the frames, `frame_camera` as in recording.json."""
+    """JSON file with `camera` and, if a second camera takes the frames, `frame_camera`, as in recording.json."""
     layout: Optional[Layout] = None  # noqa: UP045
-    """Layout of the folder: E-NeRF's ESIM sequences, EDS or TUM-VIE as published, or this package's own. None: esim,
-    and for images, videos, runs and colour filters this package's own."""
+    """Layout of the folder: that of E-NeRF's ESIM sequences, of EDS or TUM-VIE as published, or this package's own
+    (event_recording). Default: event_recording for images, videos, runs and colour filters, else esim."""
     colour: Annotated[bool, tyro.conf.arg(aliases=["--color"])] = False
-    """Make frames in colour, where the scene is."""
+    """Make frames in colour, if the scene is in colour."""
     bayer_pattern: Optional[str] = None  # noqa: UP045
-    """Colours of the event camera's pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB; None: a grey sensor."""
+    """Colour filter of the event camera: the colours of the pixels (0, 0), (1, 0), (0, 1) and (1, 1), such as RGGB.
+    Default: no filter, a grey sensor."""
     frames_per_second: Optional[float] = None  # noqa: UP045
-    """How fast a video, or the images of a folder, were recorded. None: as fast as the video is played."""
+    """Frame rate at which the video or the images of the folder were recorded. Default: the rate stated in the
+    video."""
     stamps: Optional[Path] = None  # noqa: UP045
-    """Text file with the times of the images of a folder in seconds, one a line."""
+    """Text file with the times of the images of the folder in seconds, one a line."""
     gamma: bool = True
-    """Take the images of a folder or a video for sRGB, not for linear brightness."""
+    """Take the values of the images or the video for sRGB instead of linear brightness."""
     contrast_thresholds: Optional[tuple[float, float]] = None  # noqa: UP045
-    """Change of log brightness that makes an on event, and an off event. None: as the preset, or 0.25 0.25."""
+    """Contrast thresholds of on events and of off events: the change of log brightness that causes one event. Default:
+    those of the preset, else 0.25 0.25."""
     max_displacement: float = MAX_DISPLACEMENT
-    """Pixels that a point may move at most from one picture to the next that events are made of."""
+    """Largest motion of any point, in pixels, from one rendered picture to the next."""
     max_change: float = MAX_CHANGE
-    """By how much a pixel's log brightness may change at most before it is rendered again, between pictures."""
+    """Largest change of log brightness of a pixel until it is rendered again, between two pictures."""
     sensor: Annotated[SensorSettings, tyro.conf.arg(name="")] = field(default_factory=SensorSettings)
-    """The sensor of the events."""
+    """The event sensor."""
     frame: FrameSettings = field(default_factory=FrameSettings)
-    """The sensor of the frames."""
+    """The frame sensor."""
 
     @property
     def pictures(self) -> Path | None:
-        """The folder of images or the video that is seen, if it is one."""
+        """The folder of images or the video, if the scene is one of these."""
         if self.scene is None or self.scene in PRESETS or self.scene in SCENES:
             return None
         path = expanded(self.scene)
@@ -98,29 +102,29 @@ class SimulationSettings:
 
     @property
     def reads(self) -> tuple[Path, ...]:
-        """The folders and files that the simulation is made from."""
+        """The folders and files that the simulation reads."""
         scene = self.scene if self.scene not in {*PRESETS, *SCENES, None} else None
         read = (scene, self.from_run, self.key_frames, self.trajectory, self.cameras, self.stamps)
         return tuple(Path(path) for path in read if path)
 
     @property
-    def preset(self) -> SimulationPreset | None:
-        """The preset that the scene names, if it is one."""
-        return PRESETS.get(self.scene or "")
+    def preset(self) -> SimulationPreset:
+        """Values of settings that are left out: those of the preset that `scene` names, else `USUAL`."""
+        return PRESETS.get(self.scene or "", USUAL)
 
 
 DEFAULTS = {setting.name: setting.default for setting in fields(SimulationSettings)}
 
 
 def resolve(settings: SimulationSettings) -> SimulationSettings:
-    """The settings with the layout and the sensor's contrast thresholds that they come to.
+    """The settings with their layout and contrast thresholds filled in.
 
     Raises:
-        FlagError: One is out of its range, contradicts another, or changes nothing.
+        FlagError: A setting is out of its range, contradicts another one, or changes nothing.
     """
     _check_ranges(settings)
     if bool(settings.scene) == (settings.from_run is not None):
-        raise FlagError("Give either what is to be seen, such as shapes or a mesh, or --from-run config.yml.")
+        raise FlagError("Give either a scene, such as shapes or a mesh file, or --from-run config.yml.")
     layout = settings.layout
     if layout is None:
         layout = "event_recording" if settings.pictures or settings.from_run or settings.bayer_pattern else "esim"
@@ -128,13 +132,15 @@ def resolve(settings: SimulationSettings) -> SimulationSettings:
         raise FlagError(f"--layout {layout} has no place for a --bayer-pattern; give --layout event_recording.")
     if settings.pictures and layout != "event_recording":
         raise FlagError(
-            f"{settings.pictures} has pictures and no poses, which --layout {layout} needs; give --layout "
+            f"{settings.pictures} has pictures but no poses, which --layout {layout} needs; give --layout "
             "event_recording."
         )
     _check_use(settings, layout)
     sensor = settings.sensor
-    thresholds = settings.contrast_thresholds or (settings.preset and settings.preset.contrast_thresholds)
-    if thresholds:
+    thresholds = settings.contrast_thresholds
+    if thresholds is None and settings.scene in PRESETS:
+        thresholds = settings.preset.contrast_thresholds
+    if thresholds is not None:
         sensor = replace(sensor, contrast_thresholds=thresholds)
     return replace(settings, layout=layout, sensor=sensor)
 

@@ -1,4 +1,4 @@
-"""What the simulated camera can look at: anything that has a linear brightness at any time."""
+"""Sources of brightness for the simulated camera: rendered scenes, folders of images, videos and trained runs."""
 
 from __future__ import annotations
 
@@ -31,52 +31,43 @@ if TYPE_CHECKING:
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 FRAMES_KEPT = 8
-"""Number of a video's frames that are kept for threads that ask for its frames not quite in order."""
+"""Number of decoded frames of a video that are kept, since threads do not ask for frames strictly in order."""
 
 SHARE_DECODED = 0.9
-"""Least share that can be decoded of the frames that a video states to have, which not all count exactly; with fewer,
-its end is missing."""
+"""Least fraction of the stated frames of a video that must be decoded. With fewer, the end of the video is missing; the
+fraction is below 1, since some videos state their number of frames only roughly."""
 
 OPENGL_AXES = np.array([1.0, -1.0, -1.0, 1.0])
-"""Turns the columns of a pose [R | t] from x right, y down, z forward to x right, y up, z back, and back again."""
+"""Factors of the columns of a pose [R | t] that convert it from OpenCV axes (x right, y down, z forward) to OpenGL axes
+(x right, y up, z back), and back."""
 
 
 class Source(Protocol):
-    """A picture at any time."""
+    """Anything that has a linear brightness at any time."""
 
     start: int
-    """First time at which the source can be seen, ns."""
+    """First time of which the source has a picture, ns."""
     end: int
-    """Last time at which the source can be seen, ns."""
-
-    @property
-    def width(self) -> int:
-        """Width of the picture, pixels."""
-        ...
-
-    @property
-    def height(self) -> int:
-        """Height of the picture, pixels."""
-        ...
+    """Last time of which the source has a picture, ns."""
 
     def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
-        """Linear brightness, 0 or more, grey [height, width] or R G B [height, width, 3].
+        """Linear brightness, at least 0: grey [height, width] or R G B [height, width, 3].
 
-        May be called from several threads at once.
+        Several threads may call this at once.
 
         Args:
             time: ns, from `start` to `end`.
-            pixels: Numbers, y * width + x, of those that are wanted: grey [pixels] or R G B [pixels, 3]. None: all.
+            pixels: Numbers of the wanted pixels, y * width + x; the result is then grey [pixels] or R G B [pixels, 3].
+                Default: all pixels.
         """
         ...
 
 
 class RenderedScene:
-    """A scene as the camera of a renderer sees it, moving along a trajectory."""
+    """A scene, seen by the camera of a renderer that moves along a trajectory."""
 
     def __init__(self, renderer: Renderer, trajectory: Trajectory):
         self.renderer, self.camera, self.trajectory = renderer, renderer.camera, trajectory
-        self.width, self.height = renderer.width, renderer.height
         self.start, self.end = trajectory.start, trajectory.end
 
     def brightness(self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None) -> Float[np.ndarray, "*pixels"]:
@@ -84,18 +75,18 @@ class RenderedScene:
         return self.renderer.brightness(_pose(self.trajectory, time), pixels)
 
     def depth(self, time: int) -> Float32[np.ndarray, "height width"]:
-        """z-depth in metres, 0 where nothing is hit."""
+        """z-depth in metres, 0 where no surface is seen."""
         return self.renderer.depth(_pose(self.trajectory, time))
 
 
 class Pictures(ABC):
-    """Pictures at some times, between which log brightness is linear.
+    """At least two pictures; between them log brightness is interpolated linearly in time.
 
     Args:
-        path: Where they are.
-        times: ns, strictly increasing from 0, of at least two pictures.
-        gamma: Whether their values are sRGB, else linear.
-        response: How log brightness comes of brightness.
+        path: Folder or file of the pictures.
+        times: Times of the pictures, ns, strictly increasing from 0.
+        gamma: Whether the values of the pictures are sRGB, else linear.
+        response: Response that converts brightness to log brightness.
     """
 
     width: int
@@ -116,7 +107,8 @@ class Pictures(ABC):
         """Linear brightness at a time; see `Source.brightness`.
 
         Raises:
-            RecordingError: The picture before or after this time cannot be read, or is of another kind than the first.
+            RecordingError: The picture before or after this time cannot be read, or differs from the first picture in
+                its number of bits or channels.
         """
         if not self.start <= time <= self.end:
             raise ValueError(f"{self.path} was asked for {time} ns, but lasts from {self.start} to {self.end} ns.")
@@ -136,20 +128,19 @@ class Pictures(ABC):
 
 
 class ImageFolder(Pictures):
-    """The pictures of a folder, of 8 or 16 bits, in the order of their names, in which numbers count as numbers.
+    """The pictures of a folder, of 8 or 16 bits, in the order of their names; picture10 comes after picture9.
 
     Args:
         path: The folder.
-        frames_per_second: How close the pictures are, unless their times are given.
-        stamps: Text file with the time of each picture, a line each; the first one becomes time 0.
-        unit: Of these times, "s", "us" or "ns".
-        gamma: As of `Pictures`.
-        response: As of `Pictures`.
+        frames_per_second: Frame rate of the pictures, if `stamps` is not given.
+        stamps: Text file with the time of each picture in seconds, one a line. The first picture gets time 0.
+        gamma: See `Pictures`.
+        response: See `Pictures`.
 
     Raises:
-        RecordingError: No folder, fewer than two pictures, pictures of several sizes, a first one that cannot be read,
-            or not one time a picture.
-        FlagError: Neither times nor a frame rate, or both.
+        RecordingError: The folder is missing, has fewer than two pictures, or pictures of several sizes; the first
+            picture cannot be read; or there is not one time for each picture.
+        FlagError: Both or neither of `frames_per_second` and `stamps` are given.
     """
 
     def __init__(
@@ -157,7 +148,6 @@ class ImageFolder(Pictures):
         path: Path,
         frames_per_second: float | None = None,
         stamps: Path | None = None,
-        unit: str = "s",
         gamma: bool = True,
         response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
     ):
@@ -171,7 +161,7 @@ class ImageFolder(Pictures):
         if frames_per_second is not None and stamps is None:
             times = _regular_times(path, len(files), frames_per_second)
         elif stamps is not None and frames_per_second is None:
-            times = read_times(stamps, unit)
+            times = read_times(stamps, "s")
             if len(times) != len(files):
                 raise RecordingError(
                     f"{stamps} holds {len(times):,} times, but {path} {len(files):,} pictures; give one time a picture."
@@ -206,16 +196,19 @@ class ImageFolder(Pictures):
 
 
 class Video(Pictures):
-    """The frames of a video, in colour, decoded one after the other; a step back by more than a few starts again.
+    """The frames of a video, in colour.
+
+    Frames are decoded in order. A step back by more than `FRAMES_KEPT` frames decodes the video from its start again.
 
     Args:
         path: The file, in any format that OpenCV decodes.
-        frames_per_second: How fast the frames were recorded; None: as fast as they are played.
-        gamma: As of `Pictures`.
-        response: As of `Pictures`.
+        frames_per_second: Frame rate at which the video was recorded. Default: the frame rate that it states.
+        gamma: See `Pictures`.
+        response: See `Pictures`.
 
     Raises:
-        RecordingError: No file, no video, fewer than two frames, no frame rate, or an end that is missing.
+        RecordingError: The file is missing, is no video, has fewer than two frames or no frame rate, or its end is
+            missing.
     """
 
     def __init__(
@@ -266,25 +259,26 @@ class Video(Pictures):
 
 
 class TrainedRun:
-    """A radiance field that Nerfstudio trained, as a pinhole camera sees it, moving along a trajectory.
+    """A radiance field that Nerfstudio trained, seen by a pinhole camera that moves along a trajectory.
 
-    Of a run of this package, what it renders is linear brightness; of any other method, it is taken for sRGB.
+    A run of this package renders linear brightness. Renderings of any other method are taken for sRGB.
 
     Args:
         config: config.yml of the run.
-        trajectory: In the world and the unit (for recordings, metres) of the run's data, OpenCV axes. None: that of the
-            run's recording, begun at time 0; of another method, past the cameras it was trained on, one after the other
-            in equal times.
-        duration: Of the way past these cameras, ns.
-        camera: Without distortion. None: the event camera without its distortion, or the first camera of the training.
+        trajectory: Camera to world in the coordinates of the run's data (metres for recordings), OpenCV axes. Default:
+            the trajectory of the run's recording, starting at time 0. A run of another method has no recording; there
+            the camera moves past the cameras of the training, from each to the next in equal times.
+        duration: Duration of the motion past the cameras of the training, ns.
+
+    Attributes:
+        camera: The event camera without its distortion, or the first camera of the training; may be replaced.
 
     Raises:
-        RecordingError: No such file, anything that Nerfstudio cannot load, or fewer than two cameras to move past.
+        RecordingError: The file is missing, Nerfstudio cannot load the run, or it has fewer than two cameras to move
+            past.
     """
 
-    def __init__(
-        self, config: Path, trajectory: Trajectory | None = None, duration: int = 10**9, camera: Camera | None = None
-    ):
+    def __init__(self, config: Path, trajectory: Trajectory | None = None, duration: int = 10**9):
         pipeline: Any = load_any_method(config, "inference")[1]
         from nerfstudio.models.splatfacto import SplatfactoModel
 
@@ -299,27 +293,17 @@ class TrainedRun:
         self._is_linear = isinstance(recording, EventRecording)
         if isinstance(recording, EventRecording):
             own = recording.trajectory
-            self.camera = camera or recording.camera.undistorted()
+            self.camera = recording.camera.undistorted()
             self.trajectory = trajectory or Trajectory(own.times - own.start, own.positions, own.quaternions)
         else:
-            self.camera = camera or _camera(outputs.cameras[0])
+            self.camera = _camera(outputs.cameras[0])
             self.trajectory = trajectory or self._past(outputs.cameras, duration)
         self.start, self.end = self.trajectory.start, self.trajectory.end
-
-    @property
-    def width(self) -> int:
-        """Width of the picture, pixels."""
-        return self.camera.width
-
-    @property
-    def height(self) -> int:
-        """Height of the picture, pixels."""
-        return self.camera.height
 
     def brightness(
         self, time: int, pixels: Int64[np.ndarray, " pixels"] | None = None
     ) -> Float32[np.ndarray, "*pixels"]:
-        """Linear brightness at a time, grey where the field is; see `Source.brightness`."""
+        """Linear brightness at a time, grey if the field is grey; see `Source.brightness`."""
         rgb = self._render(time, "rgb", pixels)
         if not self._is_linear:
             return linear_from_srgb(rgb.clip(0, 1)).astype(np.float32)
@@ -334,7 +318,7 @@ class TrainedRun:
 
     @torch.no_grad()
     def _render(self, time: int, output: str, pixels: np.ndarray | None = None) -> np.ndarray:
-        """What the field shows at a time, [height, width, channels], or [pixels, channels] of those that are wanted."""
+        """One output of the field at a time, [height, width, channels], or [pixels, channels] of the wanted pixels."""
         from nerfstudio.cameras.cameras import Cameras
         from nerfstudio.models.base_model import Model
 
@@ -353,14 +337,14 @@ class TrainedRun:
         casts_rays = type(self._model).get_outputs_for_camera is Model.get_outputs_for_camera
         with self._lock:
             if pixels is not None and casts_rays:
-                row, column = np.divmod(pixels, self.width)
+                row, column = np.divmod(pixels, self.camera.width)
                 places = torch.from_numpy(np.stack([row, column], axis=-1)[:, None] + 0.5).float()
                 rays = camera.generate_rays(camera_indices=0, coords=places.to(self._model.device))
                 outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
             else:
                 outputs = self._model.get_outputs_for_camera(camera)
         if output not in outputs:
-            raise RecordingError(f"{self.config} is a run of a method that renders no {output}; give one that does.")
+            raise RecordingError(f"{self.config} is a run of a method that renders no {output}; give another run.")
         values = outputs[output].float().cpu().numpy()
         if pixels is None:
             return values
@@ -368,7 +352,7 @@ class TrainedRun:
         return values if casts_rays else values[pixels]
 
     def _past(self, cameras: Any, duration: int) -> Trajectory:
-        """Trajectory through cameras of the training, in the world of the run's data."""
+        """Trajectory through the cameras of the training, in the coordinates of the run's data."""
         if len(cameras) < 2:
             raise RecordingError(f"{self.config} was trained on one camera; give a --trajectory to render it along.")
         poses = cameras.camera_to_worlds.double().cpu().numpy() * OPENGL_AXES
@@ -403,12 +387,12 @@ def _regular_times(path: Path, count: int, rate: float) -> np.ndarray:
 
 
 def _by_number(file: Path) -> tuple[list, str]:
-    """Key that sorts names so that picture10 comes after picture9."""
+    """Sort key by which picture10 comes after picture9."""
     parts = re.split(r"([0-9]+)", file.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], file.name
 
 
 def _camera(camera: Any) -> Camera:
-    """Camera made from one of Nerfstudio, without its distortion."""
+    """Camera that corresponds to a camera of Nerfstudio, without its distortion."""
     fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
     return Camera(int(camera.width), int(camera.height), fx, fy, cx - 0.5, cy - 0.5)

@@ -1,4 +1,4 @@
-"""How the simulated camera moves."""
+"""Trajectories of the simulated camera: motions, key frames, recordings and files of poses."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 POSES_PER_SECOND = 1000
 
 SHORTEST, LONGEST = 10**6, 10**12
-"""Least and most nanoseconds that a trajectory from a file may last; others' times are in another unit than was
-thought."""
+"""Shortest and longest duration (ns) of a trajectory from a file. Other durations mean that the unit of the times is
+wrong."""
 
 SMALLEST_DISTANCE = 1e-3
 """Smallest distance between a camera and its target, metres."""
 
 STEEPEST_LOOK = 0.01
-"""Angle between the view and the vertical, radians, below which upright has no meaning."""
+"""Smallest angle between the optical axis and the vertical, radians; below it, an upright camera is not defined."""
 
 
 def shake(
@@ -36,11 +36,11 @@ def shake(
     10 degrees of yaw and pitch and 5 of roll about looking at the target.
 
     Args:
-        duration: nanoseconds.
-        camera: float64 [3], mean position in metres.
-        target: float64 [3], what the camera looks at from there.
-        rng: draws the way points.
-        turns_per_second: how often the camera turns.
+        duration: Nanoseconds.
+        camera: Mean position of the camera, float64 [3], metres.
+        target: Point that the camera looks at from its mean position, float64 [3], metres.
+        rng: Draws the way points.
+        turns_per_second: Way points per second, at which the camera turns.
     """
     times = _pose_times(duration)
     knots = np.arange(int(np.ceil(duration * 1e-9 * turns_per_second)) + 2) / turns_per_second * 1e9
@@ -60,9 +60,9 @@ def shake(
 def spiral(
     duration: int, camera: np.ndarray, target: np.ndarray, rng: np.random.Generator, turns_per_second: float = 3
 ) -> Trajectory:
-    """Inward-facing spiral about the line from the camera to the target: its radius shrinks from 0.5 to 0.1 metres.
+    """Inward-facing spiral around the line from the camera to the target: its radius shrinks from 0.5 to 0.1 metres.
 
-    Args as for `shake`; `rng` draws the angle at which it starts, and a turn is one round.
+    The arguments are those of `shake`, but `rng` draws the angle at the start, and a turn is one round.
     """
     times = _pose_times(duration)
     done = times / duration
@@ -77,16 +77,16 @@ MOTIONS = {"shake": shake, "spiral": spiral}
 
 
 def key_frames(path: Path) -> Trajectory:
-    """A camera that passes upright through the places of a text file, looking at a target that moves as smoothly.
+    """The trajectory of an upright camera through the key frames of a text file.
 
-    The file has a key frame a line, `t_s x y z tx ty tz`: seconds, the place of the camera and that of its target in
-    metres, z up. Between key frames both are interpolated by PCHIP (Fritsch and Butland, 1984), which never leaves the
-    range of its neighbours. The trajectory begins at time 0.
+    Each line of the file is a key frame, `t_s x y z tx ty tz`: time in seconds, position of the camera and position of
+    the target that it looks at, in metres, z up. Between key frames both positions are interpolated by PCHIP (Fritsch
+    and Butland, 1984), which never leaves the range of neighbouring key frames. The trajectory begins at time 0.
 
     Raises:
-        RecordingError: The file is missing, no such table, has fewer than two rows, a place beyond 1e9 m, or times that
-            do not increase or last less than a millisecond or more than 1000 seconds; or the camera reaches its target
-            or looks straight up or down.
+        RecordingError: The file is missing or is no such table; it has fewer than two rows, a position beyond 1e9 m, or
+            times that do not increase or last less than a millisecond or more than 1000 seconds; or the camera reaches
+            its target or looks straight up or down.
     """
     columns = "t_s x y z tx ty tz"
     rows, numbers = read_rows(path, columns)
@@ -107,16 +107,16 @@ def key_frames(path: Path) -> Trajectory:
 
 
 def from_file(path: Path, notes: list[str], unit: str = "s") -> Trajectory:
-    """The trajectory of a recording's event camera, or that of a pose file, begun at time 0.
+    """The trajectory of a recording's event camera or of a pose file, shifted to begin at time 0.
 
     Args:
-        path: Folder of a recording in any format that `read_recording` knows, or a text file with a pose a line,
+        path: Folder of a recording in any format that `read_recording` reads, or a text file with one pose a line,
             `t px py pz qx qy qz qw`: camera to world, OpenCV axes, metres.
-        notes: Gets a sentence if quaternions of a pose file had to be renormalised.
-        unit: Of the times of a pose file, "s", "us" or "ns".
+        notes: Gets a sentence if quaternions of a pose file had to be normalised.
+        unit: Unit of the times of a pose file: "s", "us" or "ns".
 
     Raises:
-        RecordingError: The folder is no recording, or the file is no table of poses (see `read_poses`) or lasts less
+        RecordingError: The folder is no recording; or the file is no table of poses (see `read_poses`), or lasts less
             than a millisecond or more than 1000 seconds.
     """
     if path.is_dir():
@@ -127,7 +127,10 @@ def from_file(path: Path, notes: list[str], unit: str = "s") -> Trajectory:
 
 
 def sampled(trajectory: Trajectory, per_second: int) -> Trajectory:
-    """A trajectory with so many poses a second, in whole microseconds, and one at its end; itself if it has them."""
+    """The trajectory sampled at this many poses per second, at whole microseconds, with a last pose at its end.
+
+    A trajectory that already has this many poses per second is returned as it is.
+    """
     period = 10**9 // per_second
     if abs(np.median(np.diff(trajectory.times)) - period) < 1000:
         return trajectory
@@ -139,7 +142,7 @@ def sampled(trajectory: Trajectory, per_second: int) -> Trajectory:
 
 
 def look_at(camera: Float64[np.ndarray, "*batch 3"], target: Float64[np.ndarray, "*batch 3"]) -> Rotation:
-    """Rotations, camera to world, of upright cameras that see a target in their centre; z is up in the world."""
+    """Rotations, camera to world, of upright cameras that look at a target; z is up in the world."""
     forward = _normalised(target - camera)
     right = _normalised(np.cross(forward, [0, 0, 1]))
     return Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=-1))
@@ -163,7 +166,7 @@ def _from_zero(path: Path, times: np.ndarray, unit: str) -> np.ndarray:
 
 
 def _check_looks(path: Path, times: np.ndarray, looks: np.ndarray) -> None:
-    """Whether a camera is upright somewhere and always away from its target, between the poses [N, 3] too."""
+    """Refuses looks [N, 3] from camera to target that, at or between poses, are too short or vertical."""
     near = _closest(looks) < SMALLEST_DISTANCE
     steep = _closest(looks[:, :2]) < STEEPEST_LOOK * np.linalg.norm(looks[1:], axis=1)
     for wrong, what, advice in (
@@ -176,7 +179,7 @@ def _check_looks(path: Path, times: np.ndarray, looks: np.ndarray) -> None:
 
 
 def _closest(points: np.ndarray) -> np.ndarray:
-    """How near the line from each point [N, D] to the next comes to the origin, [N - 1]."""
+    """Smallest distance [N - 1] from the origin to the line from each point [N, D] to the next."""
     first, step = points[:-1], np.diff(points, axis=0)
     square = (step**2).sum(1)
     passed = np.divide(-(first * step).sum(1), square, out=np.zeros(len(step)), where=square > 0).clip(0, 1)

@@ -1,4 +1,4 @@
-"""What is looked at, by which cameras, from where and how long."""
+"""The view of a simulation: sources of brightness, cameras, trajectory and duration."""
 
 from __future__ import annotations
 
@@ -17,39 +17,35 @@ from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.paper_sequences import PRESETS
+from enerf_ns.simulator.scene.mesh_files import load_scene
 from enerf_ns.simulator.scene.render import Renderer
-from enerf_ns.simulator.scene.scene_files import load_scene
 from enerf_ns.simulator.scene.scenes import SCENES, Scene
 from enerf_ns.simulator.scene.view_check import check_view
 from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, Source, TrainedRun, Video
-from enerf_ns.simulator.trajectories import MOTIONS, POSES_PER_SECOND, from_file, key_frames, sampled
-
-SECONDS, SIZE, FIELD_OF_VIEW = 1.0, (160, 120), 60.0
-"""Length (s), width and height (pixels) and horizontal field of view (degrees) of a recording for which neither a
-preset nor a setting states them."""
+from enerf_ns.simulator.trajectories import POSES_PER_SECOND, from_file, key_frames, sampled
 
 MOST_PIXELS = 2**24
-"""Most pixels of a camera; rendering takes up to a kilobyte of memory for each."""
+"""Most pixels of a camera. Rendering takes up to a kilobyte of memory for each."""
 
 SPARSE = 20_000_000
-"""Nanoseconds between poses, above which poses are made denser where a second camera is mounted on the first."""
+"""Nanoseconds between two poses above which a trajectory is sampled more densely, if there is a second camera."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What is looked at, by which cameras, from where and how long."""
+    """Sources of brightness, cameras, trajectory and duration of a simulation."""
 
     events: Source
-    """What is looked at as the event camera sees it."""
+    """Source of brightness for the event camera."""
     frames: Source | None
-    """What is looked at as the camera of the frames sees it; None: that of the events takes them."""
+    """Source of brightness for the frame camera; None if the event camera takes the frames."""
     trajectory: Trajectory | None
     """Trajectory of the event camera; None for pictures."""
     event_camera: Camera
     frame_camera: Camera
     event_from_frame: Float64[np.ndarray, "4 4"]
-    """Pose of the camera of the frames in the axes of that of the events, metres."""
+    """Pose of the frame camera in the axes of the event camera, metres."""
     start: int
     """Start of the recording, ns."""
     end: int
@@ -57,14 +53,14 @@ class View:
 
 
 def view_of(settings: SimulationSettings, notes: list[str]) -> View:
-    """Makes or loads what is to be seen.
+    """The view that settings ask for; makes or loads its scene, pictures or run.
 
     Args:
         settings: As `settings.resolve` returns them.
-        notes: Gets what the user should know, one sentence each.
+        notes: Gets one sentence for each thing that the user should know.
 
     Raises:
-        RecordingError: What is to be seen, cameras or a trajectory cannot be read or used.
+        RecordingError: The scene, pictures, run, cameras or trajectory cannot be read or used.
         FlagError: The recording would last longer than the trajectory or the video, or a camera has too many pixels.
     """
     if settings.pictures is not None:
@@ -81,13 +77,13 @@ def _pictures_view(settings: SimulationSettings, path: Path) -> View:
         source = ImageFolder(path, rate, stamps, gamma=settings.gamma, response=response)
     else:
         source = Video(path, rate, settings.gamma, response)
-    camera = _centred(source.width, source.height, settings.field_of_view or FIELD_OF_VIEW)
+    camera = _centred(source.width, source.height, settings.field_of_view or settings.preset.field_of_view)
     return View(source, None, None, camera, camera, np.eye(4), source.start, _end(settings, source.end, str(path)))
 
 
 def _run_view(settings: SimulationSettings, config: Path, notes: list[str]) -> View:
-    duration = _duration(settings) or round(SECONDS * 1e9)
-    run = TrainedRun(absolute(config), _given_trajectory(settings, notes), duration)
+    duration = settings.duration or settings.preset.duration
+    run = TrainedRun(absolute(config), _given_trajectory(settings, notes), round(duration * 1e9))
     if settings.width or settings.height or settings.field_of_view:
         run.camera = _pinhole(settings, run.camera)
     end = _end(settings, run.end, str(settings.trajectory or settings.key_frames or config))
@@ -116,21 +112,19 @@ def _scene_view(settings: SimulationSettings, notes: list[str]) -> View:
 
 
 def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
-    """The scene that is seen, the same for the same settings.
+    """The scene of settings; the same settings always make the same scene.
 
     Args:
-        settings: With a scene.
-        notes: Gains a sentence for whatever was left out of a file.
+        settings: Their `scene` is a preset, a name in `SCENES` or a mesh file.
+        notes: As for `mesh_files.load_scene`.
 
     Raises:
-        RecordingError: The scene is none that is known, or its file cannot be used.
+        RecordingError: The name of the scene is not known, or the mesh file cannot be used.
     """
-    name, rng = settings.scene, np.random.default_rng(settings.sensor.seed).spawn(2)[0]
+    name = settings.preset.scene or settings.scene
     assert name is not None
-    if settings.preset is not None:
-        name = settings.preset.scene
     if name in SCENES:
-        scene = SCENES[name](rng)
+        scene = SCENES[name](np.random.default_rng(settings.sensor.seed).spawn(2)[0])
     else:
         path = expanded(name)
         if not path.exists():
@@ -138,19 +132,16 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
                 f"{name} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file or "
                 "folder that exists; give one of these."
             )
-        scene = load_scene(path, rng, notes)
+        scene = load_scene(path, notes)
     return scene if settings.colour or settings.bayer_pattern else scene.grey()
 
 
 def _motion(settings: SimulationSettings, scene: Scene, rng: np.random.Generator, notes: list[str]) -> Trajectory:
-    """Trajectory of the event camera, with as many poses as the layout has."""
+    """Trajectory of the event camera, with as many poses per second as the layout has."""
     trajectory, preset = _given_trajectory(settings, notes), settings.preset
-    if trajectory is None and preset is not None:
+    if trajectory is None:
         moved = replace(preset, duration=settings.duration or preset.duration, motion=settings.motion or preset.motion)
         trajectory = moved.trajectory(scene.camera, scene.target, rng)
-    elif trajectory is None:
-        motion, duration = MOTIONS[settings.motion or "shake"], _duration(settings) or round(SECONDS * 1e9)
-        trajectory = motion(duration, scene.camera, scene.target, rng)
     assert settings.layout is not None
     poses_per_second = writer_of(settings.layout).poses_per_second
     if poses_per_second is None:
@@ -173,7 +164,7 @@ def _given_trajectory(settings: SimulationSettings, notes: list[str]) -> Traject
 
 
 def _cameras(settings: SimulationSettings) -> tuple[Camera, Camera, np.ndarray]:
-    """Cameras of events and of frames, and the pose of the latter in the axes of the former."""
+    """Event camera, frame camera, and the pose of the frame camera in the axes of the event camera."""
     assert settings.layout is not None
     rig = writer_of(settings.layout).published_rig
     if settings.cameras is not None:
@@ -196,34 +187,28 @@ def _check_size(width: int, height: int) -> None:
 
 
 def _pinhole(settings: SimulationSettings, like: Camera | None = None) -> Camera:
-    """Pinhole camera of the settings, and where they are None as another camera or the preset has it."""
-    usual, angle = SIZE, FIELD_OF_VIEW
-    if like is not None:
-        usual, angle = (like.width, like.height), 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
-    elif settings.preset is not None:
-        usual, angle = (settings.preset.width, settings.preset.height), settings.preset.field_of_view
-    width = settings.width or max(1, round((settings.height or usual[1]) * usual[0] / usual[1]))
-    height = settings.height or max(1, round(width * usual[1] / usual[0]))
+    """Pinhole camera of the settings; what they leave out is taken from another camera or the preset."""
+    usual = like or settings.preset
+    angle = settings.preset.field_of_view if like is None else 2 * np.degrees(np.arctan(like.width / 2 / like.fx))
+    width = settings.width or max(1, round((settings.height or usual.height) * usual.width / usual.height))
+    height = settings.height or max(1, round(width * usual.height / usual.width))
     return _centred(width, height, settings.field_of_view or angle)
 
 
 def _centred(width: int, height: int, field_of_view: float) -> Camera:
-    """A pinhole camera that looks through the middle of its picture, as the ESIM layout wants it; degrees."""
+    """A pinhole camera with its principal point in the middle, as the ESIM layout needs; field of view in degrees."""
     _check_size(width, height)
     focal_length = float(width / 2 / np.tan(np.radians(field_of_view / 2)))
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
 
 
-def _duration(settings: SimulationSettings) -> int | None:
-    """Length of the recording that the settings state, ns."""
-    return None if settings.duration is None else round(settings.duration * 1e9)
-
-
 def _end(settings: SimulationSettings, last: int, name: str) -> int:
-    """When the recording ends (ns) of what is called `name` and can be seen until `last`."""
-    wanted = _duration(settings)
-    if wanted is not None and wanted > last:
+    """End of the recording (ns), if the source called `name` ends at `last` (ns)."""
+    if settings.duration is None:
+        return last
+    end = round(settings.duration * 1e9)
+    if end > last:
         raise FlagError(
             f"--duration is {settings.duration:g} s, but {name} lasts {last * 1e-9:.9g} s; give less or leave it out."
         )
-    return last if wanted is None else wanted
+    return end

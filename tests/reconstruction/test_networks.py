@@ -165,7 +165,7 @@ def test_the_published_firenet(firenet_weights: Path):
 
 
 class Attack:
-    """What a pickle may do: any call."""
+    """A pickle that calls a function when it is loaded."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -75,7 +75,7 @@ def test_frames_are_8_bits_of_one_range(recording: Path, reconstructed: Path):
     assert found.dtype == np.uint8 and np.abs(found - expected).max() < 0.51
 
 
-def test_what_made_them_is_told(reconstructed: Path):
+def test_the_method_of_reconstruction_is_stored(reconstructed: Path):
     made = read_recording(reconstructed)
     assert made.reconstructed_by == "a complementary filter (0.5 Hz)"
     assert "The blurred frames are reconstructed from events by a complementary filter (0.5 Hz)." in made.notes
@@ -158,7 +158,7 @@ def test_a_network(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     ("settings", "message"),
     [
         ({"weights": Path("nowhere.pth")}, "nowhere.pth is missing; a checkpoint of PyTorch was expected there"),
-        ({"weights": Path("w.pth"), "cutoff_frequency": 1.0}, "--cutoff-frequency is of the complementary filter"),
+        ({"weights": Path("w.pth"), "cutoff_frequency": 1.0}, "--cutoff-frequency is for the complementary filter"),
         ({"cutoff_frequency": -1.0}, "--cutoff-frequency is -1, but must be from 0 to 1000 (Hz)"),
         ({"cutoff_frequency": float("nan")}, "--cutoff-frequency is nan, but must be"),
         ({"frames_per_second": 10.0}, "--frames-per-second is for recordings without frames, but"),
@@ -181,7 +181,7 @@ def test_rates_that_make_no_frames_or_too_many(tmp_path: Path, rate: float):
 
 def test_a_colour_filter_is_refused(tmp_path: Path):
     source = write_recording(tmp_path / "bayer", ("frames",), bayer_pattern="RGGB")
-    with pytest.raises(UserError, match="is of a sensor with the colour filter RGGB, but frames are reconstructed"):
+    with pytest.raises(UserError, match="with the colour filter RGGB, but frames are reconstructed"):
         reconstruct(source, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
@@ -190,7 +190,7 @@ def test_frames_without_any_event_before_are_refused(tmp_path: Path):
     """A picture of one brightness has no range."""
     source = write_esim(tmp_path / "esim")
     (source / "images/image_stamps_ns.txt").write_text("1000000\n2000000\n3000000\n")
-    with pytest.raises(UserError, match="no frame that is not of one brightness"):
+    with pytest.raises(UserError, match="only frames of one uniform brightness"):
         reconstruct(source, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

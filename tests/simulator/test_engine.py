@@ -50,7 +50,7 @@ def recording(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def renderer(recording) -> Renderer:
-    """What the recording was rendered with, made again from its seed."""
+    """Renderer of the recording, made again from its seed."""
     scene_rng, _ = np.random.default_rng(0).spawn(2)
     focal_length = json.loads((recording / "simulation.json").read_text())["camera"]["fx"]
     return Renderer(SCENES["shapes"](scene_rng), camera_of(WIDTH, HEIGHT, focal_length))
@@ -162,8 +162,8 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
         (FlagError, dict(width=0), "--width is 0, but must be"),
         (FlagError, dict(bayer_pattern="RGB"), "--bayer-pattern is RGB, but must be"),
         (RecordingError, dict(scene="nowhere"), "nowhere is neither a preset"),
-        (FlagError, dict(scene=None), "Give either what is to be seen"),
-        (FlagError, dict(from_run=Path("config.yml")), "Give either what is to be seen"),
+        (FlagError, dict(scene=None), "Give either a scene"),
+        (FlagError, dict(from_run=Path("config.yml")), "Give either a scene"),
         (FlagError, dict(layout="tum_vie"), "1280 x 720"),
         (RecordingError, dict(cameras=Path("nowhere.json"), width=None, height=None), "nowhere.json is missing"),
         (RecordingError, dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),

@@ -131,7 +131,7 @@ def test_the_compiled_inverse_is_that_of_the_response(response, offset):
 
 @pytest.mark.parametrize("threshold", [0.3, 0.05])
 def test_events_of_linlog_add_up_to_its_differences(threshold):
-    """Of 255 b: b ln(20) / 20 in the dark and ln(b) above 20, to a threshold; at the times of the crossings."""
+    """The response of c = 255 b is c ln(20) / 20 in the dark and ln(c) above 20; tested at the times of crossings."""
     grey = np.array([0.0, 3.0, 19.9, 20.0, 40.0, 200.0])
     log_brightness = np.array([*(math.log(20) / 20 * grey[:3]), *np.log(grey[3:])])
     settings = SensorSettings(contrast_thresholds=(threshold, threshold), response="linlog")
@@ -548,7 +548,7 @@ def seen_between(rng: np.random.Generator, start: int, end: int, size: int) -> l
     ids=lambda settings: "-".join(settings) or "ideal",
 )
 def test_a_pixel_that_is_seen_between_pictures_fires_as_if_it_were_alone(other_settings):
-    """As a sensor of this pixel alone, of which whole pictures are taken at the times at which it is seen."""
+    """Equal to a sensor of one pixel that gets whole pictures at the same times."""
     shape, size, rng = (4, 6), 24, np.random.default_rng(3)
     settings: dict[str, Any] = dict(contrast_thresholds=(0.13, 0.19), **other_settings)
     times = np.arange(25) * MS + 77

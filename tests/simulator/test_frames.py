@@ -136,7 +136,7 @@ def test_read_noise_has_its_standard_deviation_at_any_brightness():
 
 
 def test_shot_noise_is_that_of_the_electrons():
-    """Of n electrons the standard deviation is the square root of n."""
+    """The standard deviation of n electrons is the square root of n."""
     for brightness in (0.1, 0.5):
         settings = FrameSettings(saturation=1.25, shot_noise=1000.0)
         image = develop(np.full((300, 300), brightness), settings, 0, False).astype(float)

@@ -13,7 +13,7 @@ from enerf_ns.simulator.paper_sequences import PRESETS, SimulationPreset
 from enerf_ns.simulator.scene.scenes import SCENES
 
 PIXELS = 64
-"""Of the tests' pictures is every so many of the rows and columns."""
+"""Step between the rows and columns that the tests render."""
 
 SEEDS = range(40)
 
@@ -37,7 +37,7 @@ def poses_of(preset: SimulationPreset, seed: int, times: np.ndarray) -> np.ndarr
 
 
 def on_the_ground(preset: SimulationPreset, pose: np.ndarray) -> np.ndarray:
-    """Where the rays of a camera meet the plane z = 0, about which all these scenes lie, [N, 3]."""
+    """Points [N, 3] at which the rays of a camera meet the plane z = 0, near which all these scenes lie."""
     directions = rays_of(preset)[0] @ pose[:, :3].T
     return pose[:, 3] - directions * pose[2, 3] / directions[:, 2:]
 

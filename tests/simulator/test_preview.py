@@ -42,7 +42,7 @@ def test_each_picture_shows_its_frame_blurred_frame_events_and_depth(tmp_path: P
     depth = np.full((HEIGHT, WIDTH), 2.0)
     depth[:, 32:] = 4.0
     depth[32:, 32:] = 0
-    with Preview(tmp_path / "preview.mp4", WIDTH, HEIGHT, frames_per_second=7) as preview:
+    with Preview(tmp_path / "preview.mp4", WIDTH, HEIGHT) as preview:
         for number in range(5):
             if number == 1:
                 preview.add_events(block(16, 0, 1))
@@ -51,7 +51,7 @@ def test_each_picture_shows_its_frame_blurred_frame_events_and_depth(tmp_path: P
             grey = np.full((HEIGHT, WIDTH), 40 * number, np.uint8)
             preview.add_frame(grey, 255 - grey, depth)
     pictures, rate = decode(tmp_path / "preview.mp4")
-    assert pictures.shape == (5, HEIGHT, 4 * WIDTH, 3) and rate == pytest.approx(7)
+    assert pictures.shape == (5, HEIGHT, 4 * WIDTH, 3) and rate == pytest.approx(10)
     for number, picture in enumerate(pictures):
         np.testing.assert_allclose(colour_at(picture, 16, 16), 40 * number, atol=6)
         np.testing.assert_allclose(colour_at(picture, WIDTH + 16, 16), 255 - 40 * number, atol=6)

@@ -1,4 +1,4 @@
-"""What settings come to."""
+"""Tests of `settings.resolve`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_what_is_resolved_stays_as_it_is():
 
 
 def test_pictures_have_no_poses_for_other_layouts():
-    with pytest.raises(FlagError, match=r"^clip\.mp4 has pictures and no poses, which --layout esim needs; give"):
+    with pytest.raises(FlagError, match=r"^clip\.mp4 has pictures but no poses, which --layout esim needs; give"):
         resolve(SimulationSettings("clip.mp4", layout="esim"))
 
 

@@ -108,7 +108,7 @@ def test_summed_events_stay_within_a_threshold_of_the_brightness_at_any_time(nam
     times = times_of(source, np.array([source.start, source.end]))
     events = events_of(source, times, SensorSettings(contrast_thresholds=(threshold, threshold)))
     at = np.sort(np.random.default_rng(2).integers(source.start, source.end, 150))
-    sums = rebuilt_at(events, at, threshold, (source.height, source.width))
+    sums = rebuilt_at(events, at, threshold, (source.camera.height, source.camera.width))
     true = np.stack([np.log(EPS + source.brightness(time)) for time in at.tolist()])
     error = np.abs(true - np.log(EPS + source.brightness(source.start)) - sums)
     assert (error <= threshold).mean() >= 0.995
@@ -135,7 +135,7 @@ def test_twice_as_many_renders_create_and_lose_hardly_an_event(name, size):
         times = times_of(source, stops, max_displacement)
         events = events_of(source, times, SensorSettings())
         counts.append(len(events))
-        sums.append(np.zeros((source.height, source.width)))
+        sums.append(np.zeros((source.camera.height, source.camera.width)))
         np.add.at(sums[-1], (events.y, events.x), events.p)
     assert counts[1] > 5000
     assert abs(counts[0] - counts[1]) <= 0.01 * counts[1]
@@ -143,7 +143,7 @@ def test_twice_as_many_renders_create_and_lose_hardly_an_event(name, size):
 
 
 PERIOD, SWING, MIDDLE = 60.0, 0.9, -1.2
-"""Of a texture whose log brightness is a sine: pixels, and log brightness."""
+"""Wavelength (pixels), amplitude and mean (log brightness) of a texture whose log brightness is a sine."""
 
 
 def waves(speed: float, duration: int) -> RenderedScene:

@@ -42,7 +42,7 @@ def matrices(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
 
 
 def pixel_of(point: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Where a point is seen by a camera of focal length 100 and principal point (50, 40)."""
+    """Pixel at which a camera with focal length 100 and principal point (50, 40) sees a point."""
     rotation = cv2.Rodrigues(np.ascontiguousarray(pose[:, :3].T))[0]
     matrix = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     return cv2.projectPoints(point[None], rotation, -pose[:, :3].T @ pose[:, 3], matrix, np.zeros(4))[0].ravel()

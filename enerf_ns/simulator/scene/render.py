@@ -1,9 +1,14 @@
 """Pictures and depth of a scene, seen by a camera of any model.
 
-The picture is quartered again and again, and with it the list of triangles that may be seen in a part of it, down to
-blocks of 256 samples in which every triangle of the list is tried. A sample sees a triangle if its direction lies on
-the inner side of the three planes through an edge and the camera: Olano, Greer: Triangle scan conversion using 2D
-homogeneous coordinates, 1997. That takes no projection and no clipping, so that a camera is a table of directions.
+The picture is divided into quarters recursively, down to blocks of 256 samples. For each part a list of the triangles
+that may be visible in it is kept. In a block every triangle of its list is tested. A sample sees a triangle if its
+direction lies on the inner side of the three planes through the camera and an edge (Olano, Greer: Triangle scan
+conversion using 2D homogeneous coordinates, 1997). This needs no projection and no clipping, so that a camera is a
+table of directions.
+
+Open3D's `RaycastingScene` was tried in place of this. On one thread, 160 x 120 pixels of 16 samples take it 56 ms for
+the hits alone in the scene shapes (3,936 triangles) and 70 ms in the scene moon (80,000 triangles); this module takes 5
+ms and 15 ms with shading.
 """
 
 from __future__ import annotations
@@ -18,52 +23,52 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.simulator.scene.scenes import Scene
 
 GROUP = 4
-"""Samples that take brightness from one place, in their middle, if they all see the same triangle."""
+"""Samples that share one look-up of brightness, in their middle, if they all see the same triangle."""
 
 _HAMMERSLEY = np.stack([np.arange(16), [int(f"{i:04b}"[::-1], 2) for i in range(16)]], axis=1) / 16 - 15 / 32
 
 SAMPLES = _HAMMERSLEY[np.lexsort((_HAMMERSLEY > 0).T)]
-"""Where in a pixel, x and y from its centre, triangles are looked for: a Hammersley set, by quarters of the pixel."""
+"""Offsets (x, y) of the samples from the centre of a pixel, in pixels: a Hammersley set, ordered by quarters."""
 
 CENTRE = np.zeros((1, 2))
 
 BLOCK = 256
-"""Samples that a triangle is tried in at once: the loop over them becomes vector instructions."""
+"""Samples in which a triangle is tested at once; the loop over them compiles to vector instructions."""
 
 SLACK = 1e-4
-"""By how much of its size a part of the picture is taken to be larger than it is, against rounding."""
+"""Fraction of its size by which a part of the picture is enlarged, against rounding."""
 
 EDGE_ON = 1e-7
-"""Sine of the angle between a triangle and the ray to one of its corners below which it is not seen."""
+"""Sine of the angle between a triangle and the ray to its corner below which the triangle is invisible."""
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 class Renderer:
-    """Renders a scene for a camera. A picture takes one thread, and several threads may render at once.
+    """Renders a scene for a camera. A picture uses one thread; several threads may render at once.
 
     Args:
-        scene: What to render.
-        camera: Of any model.
-        places: Where in a pixel it is looked, x and y from its centre in pixels; 1, 4, 16 or 64 places.
+        scene: The scene.
+        camera: A camera of any model.
+        places: Offsets of the samples from the centre of a pixel, in pixels; 1, 4, 16 or 64 of them.
 
     Raises:
         ValueError: The distortion of the camera has no inverse at some pixel.
     """
 
     def __init__(self, scene: Scene, camera: Camera, places: Float64[np.ndarray, "places 2"] = SAMPLES):
-        self.scene, self.camera, self.width, self.height = scene, camera, camera.width, camera.height
+        self.scene, self.camera = scene, camera
         self._samples, self._centres = _Samples.of(camera, places), _Samples.of(camera, CENTRE)
 
     def brightness(
         self, pose: Float64[np.ndarray, "3 4"], pixels: Int64[np.ndarray, " pixels"] | None = None
     ) -> Float32[np.ndarray, "*pixels"]:
-        """Mean linear brightness of every pixel's area: [height, width] of a grey scene, [height, width, 3] of others.
+        """Mean linear brightness over the area of every pixel: [height, width], or [height, width, 3] for colour.
 
         Args:
             pose: Camera to world, OpenCV axes, metres.
-            pixels: Numbers, y * width + x, of those that are wanted: [pixels] of a grey scene, [pixels, 3] of others.
-                They have the same brightness as in a whole picture. None: the whole picture.
+            pixels: Numbers of the wanted pixels, y * width + x; the result is then [pixels], or [pixels, 3] for colour,
+                and equal to the whole picture at these pixels. Default: all pixels.
         """
         scene, samples = self.scene, self._samples
         order = samples.order if pixels is None else samples.order.reshape(-1)[pixels]
@@ -92,22 +97,22 @@ class Renderer:
 
 @dataclass(frozen=True)
 class _Samples:
-    """Directions (x, y, 1), camera axes, in which a camera is sampled, by square blocks of pixels; and their tree."""
+    """Directions (x, y, 1) of the samples of a camera, in camera axes, by square blocks of pixels; and their tree."""
 
     x: Float32[np.ndarray, "blocks 256"]
-    """x of each direction: within a block by pixel, row by row, and within a pixel by sample."""
+    """x of each direction: in a block ordered by pixel, row by row, and in a pixel by sample."""
     y: Float32[np.ndarray, "blocks 256"]
     sizes: Float32[np.ndarray, "blocks pixels"]
-    """Side of a square as large as the share of a pixel that a group of samples stands for, in x and y."""
+    """Side of a square with the area that a group of samples represents, in the unit of x and y."""
     order: Int64[np.ndarray, "height width"]
-    """Where each pixel of the picture stands among the pixels of all blocks."""
+    """Index of each pixel of the picture among the pixels of all blocks."""
     tree: tuple[Int32[np.ndarray, "nodes 3"], Float32[np.ndarray, "nodes 4"]]
-    """Nodes of the tree, depth first: level (0: one block), the node that follows its last descendant, and its first
-    block. And the bounds of each node: least and largest x, least and largest y."""
+    """Nodes of the tree, depth first, and their bounds. A node has its level (0 is one block), the number of the node
+    after its last descendant, and its first block. Bounds are least and largest x, least and largest y."""
 
     @classmethod
     def of(cls, camera: Camera, offsets: Float64[np.ndarray, "samples 2"]) -> _Samples:
-        """Samples at these offsets from the centre of every pixel, x and y in pixels; 1, 4, 16 or 64 of them."""
+        """Samples at these offsets from the centre of every pixel, in pixels; 1, 4, 16 or 64 of them."""
         directions, (right, down) = camera.pixel_directions(), camera.pixel_steps()
         sizes = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]) * GROUP / len(offsets))
         side = round((BLOCK / len(offsets)) ** 0.5)
@@ -121,7 +126,7 @@ class _Samples:
         code = code[along]
 
         def blocks(pixels: np.ndarray) -> np.ndarray:
-            """[height, width, N] as [blocks, pixels * N]; what stands over the edge repeats it."""
+            """Converts [height, width, N] to [blocks, pixels * N]; blocks beyond the edge repeat the edge."""
             beyond = [(0, rows * side - camera.height), (0, columns * side - camera.width), (0, 0)]
             padded = np.pad(pixels, beyond, mode="edge").reshape(rows, side, columns, side, -1)
             return padded.swapaxes(1, 2).reshape(rows * columns, -1)[along]
@@ -152,7 +157,7 @@ class _Samples:
     def tree_above(
         self, places: Int64[np.ndarray, " pixels"]
     ) -> tuple[Int32[np.ndarray, "nodes 3"], Float32[np.ndarray, "nodes 4"]]:
-        """The part of the tree that leads to the blocks with these pixels, given by where they stand among all."""
+        """The part of the tree above the blocks of some pixels, given by their indices as in `order`."""
         nodes, bounds = self.tree
         wanted = np.zeros(len(self.x) + 1, np.int64)
         wanted[1 + places // self.sizes.shape[1]] = 1
@@ -167,14 +172,14 @@ class _Samples:
 
 @compiled
 def _see(triangles, pose, view):  # pragma: no cover
-    """What tells where a direction (x, y, 1) of camera axes hits each triangle that may be in view, float32 [N, 16];
-    and which triangles these are.
+    """Edge vectors and boxes of the triangles that may be in view, float32 [N, 16], and their numbers, int32 [N].
 
-    Four vectors: of the direction's inner products with the first three none is negative where it hits the triangle,
-    and they are in the proportion of the weights of the corners; that with the fourth is one over the depth. Elsewhere
-    one of them is negative. An edge that two triangles share has the same vector in both, but for its sign, so that no
-    direction slips through; at a corner that several share one may, within rounding. Then a box around the triangle:
-    least and largest x, least and largest y, as in `view`.
+    The first 12 numbers are four vectors. The inner products of a direction (x, y, 1), in camera axes, with the first
+    three vectors are all at least 0 if the direction hits the triangle; they are then proportional to the weights of
+    the corners. Otherwise one of them is negative. The inner product with the fourth vector is one over the depth. Two
+    triangles with a common edge have the same vector for it, with opposite sign, so that no direction passes between
+    them; at a common corner a direction may, within rounding. The last 4 numbers are a box around the triangle: least
+    and largest x, least and largest y, as in `view`.
     """
     seen, faces = np.empty((len(triangles), 16), np.float32), np.empty(len(triangles), np.int32)
     corners, normals, normal = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -217,7 +222,7 @@ def _see(triangles, pose, view):  # pragma: no cover
 
 @compiled
 def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
-    """Depth of every sample, 0 where it sees nothing, [blocks, 256]."""
+    """Depth of every sample [blocks, 256], 0 where it sees no triangle."""
     depth, closeness, faces = np.zeros(x.shape, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     lists, lengths = _all(seen, nodes)
     node, block = _next(seen, x, y, nodes, bounds, 0, lists, lengths, faces, closeness)
@@ -231,7 +236,7 @@ def _measure(seen, x, y, nodes, bounds):  # pragma: no cover
 
 @compiled
 def _all(seen, nodes):  # pragma: no cover
-    """Room, for `_next`, for the triangles that may be seen at each level, and all triangles for the whole picture."""
+    """Lists of candidate triangles for each level of `_next`; that of the whole picture holds all triangles."""
     levels = nodes[0, 0] + 1 if len(nodes) > 0 else 1
     lists, lengths = np.empty((levels + 1, len(seen)), np.int32), np.zeros(levels + 1, np.int64)
     lists[levels], lengths[levels] = np.arange(len(seen)), len(seen)
@@ -240,9 +245,10 @@ def _all(seen, nodes):  # pragma: no cover
 
 @compiled
 def _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness):  # pragma: no cover
-    """From a node on, the next block in which triangles may be seen, and the node after it; -1: there is none.
+    """The node to continue with, and the next block, from a node on, that may see triangles; -1 if there is none.
 
-    Writes, [256] each, the triangle that every sample of the block sees (-1: none), and one over its depth (0: none).
+    Writes the triangle that each sample of the block sees (-1 for none) and one over its depth (0 for none), [256]
+    each.
     """
     while node < len(nodes):
         level, after, block = nodes[node]
@@ -257,7 +263,10 @@ def _next(seen, x, y, nodes, bounds, node, lists, lengths, faces, closeness):  #
 
 @compiled
 def _select(seen, candidates, bounds, selected):  # pragma: no cover
-    """Selects triangles whose box meets the bounds and that have a corner of these within each edge; counts them."""
+    """Selects triangles whose box meets the bounds and whose edges each have a corner of the bounds on the inner side.
+
+    Returns their number.
+    """
     left, right, top, bottom = bounds[0], bounds[1], bounds[2], bounds[3]
     count = 0
     for f in candidates:
@@ -272,7 +281,7 @@ def _select(seen, candidates, bounds, selected):  # pragma: no cover
 
 @compiled
 def _try(seen, candidates, x, y, faces, closeness):  # pragma: no cover
-    """Which of the triangles the samples of a block see."""
+    """Finds the nearest of some triangles that each sample of a block sees, and one over its depth."""
     for f in candidates:
         p = seen[f]
         a0, a1, a2, b0, b1, b2 = p[0], p[1], p[2], p[3], p[4], p[5]
@@ -296,7 +305,7 @@ def _shade(
 ):  # fmt: skip  # pragma: no cover
     """Mean over the samples of a wanted pixel of shade times texture, [blocks, pixels, C].
 
-    A step is taken for all places of a block before the next one, so that it becomes vector instructions.
+    Each step is done for all places of a block before the next step, so that it compiles to vector instructions.
     """
     channels, pixels = texels.shape[1], sizes.shape[1]
     picture = np.full((len(x), pixels, channels), np.float32(background))
@@ -359,9 +368,9 @@ def _shade(
 
 @compiled
 def _places(x, y, hit, wanted, px, py, face, pixel, share):  # pragma: no cover
-    """Where a block takes brightness from, in which triangle, for which pixel and by which share; counts these places.
+    """Finds the places where a block looks up brightness, with triangle, pixel and weight; returns their number.
 
-    One place for every group of samples that see the same triangle, else one for each of the samples.
+    A group of samples that all see the same triangle has one place; otherwise each of its samples has one.
     """
     samples = BLOCK // len(wanted)
     count = 0
@@ -386,7 +395,7 @@ def _places(x, y, hit, wanted, px, py, face, pixel, share):  # pragma: no cover
 
 @compiled
 def _look_up(texels, channel, start, side, s, t, count, value):  # pragma: no cover
-    """Interpolates bilinearly in the level of side x side texels from `start` on, repeating at its borders."""
+    """Interpolates bilinearly in a periodic level of side x side texels that begins at row `start`."""
     for k in range(count):
         mask, scale = np.int32(side[k] - 1), np.float32(side[k])
         across, along = s[k] * scale - HALF, t[k] * scale - HALF

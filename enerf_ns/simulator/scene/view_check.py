@@ -1,4 +1,9 @@
-"""Whether a simulated camera is anywhere where it should not be: inside of something, or where it sees nothing."""
+"""Checks of a simulated camera: it must stay outside of solids, on one side of the walls of rooms, and see something.
+
+Solids, whose faces look outwards, and rooms, whose faces look inwards, have winding numbers of opposite sign. Open3D's
+`RaycastingScene.compute_occupancy` is no replacement: it calls the inside of a room occupied, gets open meshes wrong,
+and needs system libraries that bare machines lack.
+"""
 
 from __future__ import annotations
 
@@ -7,53 +12,50 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
-from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.sources import RenderedScene
 
 PATH_STEP, MOST_PATH_STEPS = 2_000_000, 10_000
-"""Nanoseconds of the camera's way that are taken for a straight line, and how many of these lines there are at most."""
+"""Nanoseconds of the trajectory that are taken for a straight line, and the most of these lines."""
 
 LOOK_STEP, MOST_LOOKS = 10_000_000, 1000
-"""Nanoseconds from one look at the scene to the next, and how many looks there are at most."""
+"""Nanoseconds from one look at the scene to the next, and the most looks."""
 
 FEWEST_STEPS = 50
-"""How many lines the camera's way has, and how many looks there are, at least."""
+"""Fewest lines of the trajectory, and fewest looks."""
 
 PLACES = 20
-"""Number of places where all surfaces around the camera are looked for; in between, those that it passes through."""
+"""Number of positions at which every surface around the camera is checked. Between them only surfaces that the camera
+passes through are checked."""
 
 INSIDE = 0.5
-"""Winding number above which a camera is inside; of a closed surface it is 1 there and 0 outside."""
+"""Winding number above which a camera is inside. A closed surface has 1 inside and 0 outside."""
 
 SAME_PLACE = 1e-6
-"""Share of a line of the way within which the places where it passes through surfaces are taken for one."""
-
-PIXEL_STEP = 8
-"""Of this many rows or columns, one is looked along first."""
+"""Part of a line of the trajectory within which two crossings of surfaces are taken for one."""
 
 GRID_BITS = 21
-"""Number of bits of each coordinate; corners that are the same in these are taken for one."""
+"""Bits of each coordinate of a corner. Corners that are equal in these bits are taken for one."""
 
 
 def check_view(name: str, what: str, source: RenderedScene, start: int, end: int, notes: list[str]) -> None:
-    """Whether a camera is outside of everything at all times, and sees a surface at some.
+    """Refuses a camera that is inside of a solid, passes through a wall, or never sees a surface.
 
     Args:
-        name: Of the scene, for the errors.
-        what: The camera, for errors and notes.
+        name: Name of the scene, for errors and notes.
+        what: Name of the camera, for errors and notes.
         source: The scene as the camera sees it.
-        start, end: From when to when, ns.
-        notes: Gains a sentence if there are times at which the camera sees nothing.
+        start, end: Beginning and end of the recording, ns.
+        notes: Gets a sentence if there are times at which the camera sees nothing.
 
     Raises:
-        RecordingError: The camera is inside of a surface that looks outwards, or never sees anything.
+        RecordingError: The camera is inside of a closed surface that looks outwards, passes through a closed surface
+            that looks inwards, or never sees anything.
     """
     path_times, look_times = (
         np.linspace(start, end, int(np.clip((end - start) // step, FEWEST_STEPS, most)) + 1).astype(np.int64)
@@ -64,12 +66,11 @@ def check_view(name: str, what: str, source: RenderedScene, start: int, end: int
 
 
 def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Trajectory, times: np.ndarray) -> None:
-    """Whether a camera stays outside of all surfaces that look outwards, and are closed or nearly so.
+    """Refuses a camera inside of a solid, or one that passes from inside of a room to outside, or back.
 
-    And whether it passes from inside of those that look inwards to outside, or back.
-
-    Each connected part of the triangles is looked at for itself, by its generalised winding number (Jacobson, Kavan,
-    Sorkine-Hornung, SIGGRAPH 2013), since the room that a solid stands in has -1 at all places.
+    Inside is decided by the generalised winding number (Jacobson, Kavan, Sorkine-Hornung, SIGGRAPH 2013), which also
+    suits surfaces with holes. Each connected part of the triangles has a winding number of its own: inside of a room
+    that of the room is -1, so that the sum with a solid's would be 0.
     """
     parts = _Parts(triangles)
     positions = _poses(trajectory, times)[:, :, 3]
@@ -92,7 +93,7 @@ def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Traj
             raise RecordingError(
                 f"{name}: {seconds:.3f} s after the beginning {what} is at {_shown(position)} m, inside of a surface "
                 f"that looks outwards and reaches from {_shown(lower)} to {_shown(upper)} m; move the camera or what "
-                "it is in, or, if that is a room, turn its faces to look inwards (inward of a scene file's part)."
+                "it is in, or, if that is a room, turn its faces to look inwards."
             )
     for at, _ in walls:
         seconds = (np.interp(at, np.arange(len(times)), times) - times[0]) * 1e-9
@@ -103,32 +104,29 @@ def _check_outside(name: str, what: str, triangles: np.ndarray, trajectory: Traj
 
 
 def _check_sight(name: str, what: str, source: RenderedScene, times: np.ndarray, notes: list[str]) -> None:
-    """Whether a camera sees a surface: tried along some pixels, and if these see nothing, along all."""
-    scene, camera, trajectory = source.renderer.scene, source.renderer.camera, source.trajectory
-    directions = camera.pixel_directions()[::PIXEL_STEP, ::PIXEL_STEP, :2]
-    height, width = directions.shape[:2]
-    coarse = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, model="lookup", directions=directions)
-    looks = RenderedScene(Renderer(scene, coarse), trajectory), source
-    blind = np.array([not any(look.depth(time).any() for look in looks) for time in times.tolist()])
+    """Refuses a camera that never sees a surface, and notes when it sees none."""
+    blind = np.array([not source.depth(time).any() for time in times.tolist()])
     if blind.all():
-        pose = _poses(trajectory, times[:1])[0]
-        lower, upper = scene.triangles.min((0, 1)), scene.triangles.max((0, 1))
+        pose = _poses(source.trajectory, times[:1])[0]
+        triangles = source.renderer.scene.triangles
+        lower, upper = triangles.min((0, 1)), triangles.max((0, 1))
         raise RecordingError(
             f"{name}: {what} never sees anything, since all surfaces lie between {_shown(lower)} and {_shown(upper)} "
             f"m, but at the beginning it is at {_shown(pose[:, 3])} m and looks along {_shown(pose[:, 2])}; move or "
             "turn it."
         )
     if blind.any():
-        first, last = _longest(blind)
-        start, end = (times[[first, last]] - times[0]) * 1e-9
+        first = (times[blind][0] - times[0]) * 1e-9
         notes.append(
-            f"{name}: {what} sees nothing for {100 * blind.mean():.3g} % of the time, longest from {start:.3f} to "
-            f"{end:.3f} s."
+            f"{name}: {what} sees nothing for {100 * blind.mean():.3g} % of the time, first {first:.3f} s after the "
+            "beginning."
         )
 
 
 def winding_number(corners: Float64[np.ndarray, "faces 3 3"], point: Float64[np.ndarray, "3"]) -> float:
-    """How many times triangles surround a point, by their solid angles (van Oosterom and Strackee, 1983).
+    """The generalised winding number of a point: how many times triangles surround it.
+
+    Sum of the solid angles (van Oosterom and Strackee, 1983) over 4 pi.
 
     Args:
         corners: In metres, counter-clockwise as seen from outside.
@@ -143,7 +141,7 @@ def winding_number(corners: Float64[np.ndarray, "faces 3 3"], point: Float64[np.
 
 
 class _Parts:
-    """The triangles of a scene, part by part; triangles with a corner in one place are of one part."""
+    """The triangles of a scene, by connected part; triangles that share the place of a corner are connected."""
 
     def __init__(self, triangles: Float32[np.ndarray, "faces 3 3"]):
         corners = triangles.reshape(-1, 3).astype(np.float64)
@@ -164,12 +162,15 @@ class _Parts:
         return self.triangles[self.starts[part] : self.starts[part + 1]]
 
     def around(self, point: Float64[np.ndarray, "3"]) -> list[int]:
-        """Parts in whose bounding box a point is; of no other it can be inside."""
+        """Numbers of the parts whose bounding box holds a point, which can be inside of no other part."""
         return np.flatnonzero(((self.lower <= point) & (point <= self.upper)).all(1)).tolist()
 
 
 def _crossings(parts: _Parts, positions: Float64[np.ndarray, "positions 3"]) -> list[tuple[float, int]]:
-    """Which parts are passed through where on the way from position to position; 0.5 is halfway to the second."""
+    """The places where the lines from position to position cross triangles, in order, with the number of the part.
+
+    The place 0.5 is halfway from the first position to the second.
+    """
     lower, upper = parts.triangles.min(1), parts.triangles.max(1)
     near = ((lower <= positions.max(0)) & (upper >= positions.min(0))).all(1)
     triangles, number, lower, upper = parts.triangles[near], parts.number[near], lower[near], upper[near]
@@ -186,7 +187,10 @@ def _crossings(parts: _Parts, positions: Float64[np.ndarray, "positions 3"]) -> 
 def _passed(
     triangles: Float64[np.ndarray, "faces 3 3"], start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, " faces"]:
-    """Share of a line that is over where it passes through each triangle; nan where it does not (Möller, Trumbore)."""
+    """The place where a line crosses each triangle: 0 at the start of the line, 1 at its end; nan where it does not.
+
+    Method of Möller and Trumbore, Journal of Graphics Tools 1997.
+    """
     first, direction = triangles[:, 0], end - start
     one, other = triangles[:, 1] - first, triangles[:, 2] - first
     across, offset = np.cross(direction, other), start - first
@@ -200,19 +204,12 @@ def _passed(
 
 
 def _position(positions: Float64[np.ndarray, "positions 3"], at: float) -> Float64[np.ndarray, "3"]:
-    """Position at a place of the way from position to position; 0.5 is halfway to the second."""
+    """The position at a place, such as 0.5 for halfway from the first position to the second."""
     return np.array([np.interp(at, np.arange(len(positions)), axis) for axis in positions.T])
 
 
 def _poses(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
     return trajectory.poses(torch.from_numpy(times)).numpy()
-
-
-def _longest(mask: Bool[np.ndarray, " times"]) -> tuple[int, int]:
-    """First and last index of the longest run of times at which a mask is true."""
-    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
-    first, after = edges[np.argmax(np.diff(edges, axis=1))].tolist()
-    return first, after - 1
 
 
 def _shown(point: np.ndarray) -> str:

@@ -468,7 +468,7 @@ def coverage(camera: Camera, line: np.ndarray) -> np.ndarray:
 
 
 def half_plane(line: np.ndarray) -> Scene:
-    """What is white where line . (x, y, 1) >= 0, and else black."""
+    """A scene that is white where line . (x, y, 1) >= 0, else black."""
     normal = line[:2] / np.hypot(*line[:2])
     start, along = -normal * line[2] / np.hypot(*line[:2]), 50 * np.array([-normal[1], normal[0]])
     corners = np.array([start - along, start + along, start + along + 50 * normal, start - along + 50 * normal])
