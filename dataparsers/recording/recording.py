@@ -386,6 +386,11 @@ class EventRecording:
         """Whether there are frames of any kind."""
         return self.frames is not None or self.blurred_frames is not None
 
+    @property
+    def camera_frames(self) -> Frames | None:
+        """Frames that a camera took: the sharp ones, else the blurred ones, unless those are reconstructed from events."""
+        return self.frames or (self.blurred_frames if self.reconstructed_by is None else None)
+
     def locate(self, index: int) -> str:
         """File and line, or number, of an event of the stream, for error messages."""
         return self.locate_event(index) if self.locate_event else f"{self.path}, event {index + 1},"
