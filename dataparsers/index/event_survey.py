@@ -142,7 +142,8 @@ def sorted_bands(
 
 
 def _narrow(column: Int[np.ndarray, " events"]) -> np.ndarray:
-    """A column as int32, the one type of the compiled loops. Larger values become the largest int32, an error as before."""
+    """A column as int32, the one type of the compiled loops. Larger values become the largest int32, an error as
+    before."""
     if column.dtype.itemsize < 4 or column.dtype == np.int32:
         return column.astype(np.int32, copy=False)
     limits = np.iinfo(np.int32)

@@ -46,8 +46,8 @@ SMALLEST_FIT = 0.6
 else is wrong."""
 
 LENS_GAIN = 1.05
-"""Factor by which another lens must sharpen the events before the best focal length is searched around it. The factor is
-1.1 if the focal length is wrong by a fifth."""
+"""Factor by which another lens must sharpen the events before the best focal length is searched around it. The factor
+is 1.1 if the focal length is wrong by a fifth."""
 
 SMALLEST_TURN = math.radians(0.5)
 """Angle by which the camera must turn within a window before another lens is tried. Without turns, the focal length
@@ -60,14 +60,15 @@ LARGEST_DELAY_ERROR = 3.0
 """Largest standard error (ms) of an identifiable delay."""
 
 LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR_SHARE = 0.02, 0.1
-"""Largest standard error of an identifiable scale of the focal length, and the same as a share of its difference from 1.
-The scale of another lens need not be known as well."""
+"""Largest standard error of an identifiable scale of the focal length, and the same as a share of its difference from
+1. The scale of another lens need not be known as well."""
 
 FEWEST_SAMPLES = 3
 """Fewest frames, or tiles of windows, that give a standard error."""
 
 HARMFUL_SHIFT = 0.95
-"""Pixels by which a clock may shift the picture. In dim light, the latency of a sensor's pixels is some milliseconds."""
+"""Pixels by which a clock may shift the picture. In dim light, the latency of a sensor's pixels is some
+milliseconds."""
 
 HARMFUL_SCALE = 0.03
 """Share by which a focal length may differ from the best one."""
@@ -98,7 +99,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class CornerFit:
-    """How well corners of frames agree with poses and calibration."""
+    """The agreement of corners of frames with poses and calibration."""
 
     camera: Camera
     """Camera of the frames."""
@@ -202,7 +203,7 @@ def _plane_and_frame_delay(edges: FrameEdges, largest: int) -> tuple[int, Estima
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How well poses, clocks and focal length of a recording agree with its events."""
+    """The agreement of poses, clocks and focal length of a recording with its events."""
 
     focus: EventFocus
     edges: FrameEdges | None
@@ -212,7 +213,8 @@ class Agreement:
     sharpness: dict[Hypothesis, float]
     """Sharpness of each hypothesis that was tried. Only ratios have a meaning."""
     readings: list[Reading]
-    """Readings of the poses that make events sharpest, all about as sharp. `AS_READ` is the first if nothing is wrong."""
+    """Readings of the poses that make events sharpest, all about as sharp. `AS_READ` is the first if nothing is
+    wrong."""
     is_clear: bool
     """Whether these readings are clearly sharper than all others."""
     pose_delay: Estimate

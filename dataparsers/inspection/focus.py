@@ -146,12 +146,13 @@ class Window:
 class EventFocus:
     """Motion compensation of the events in some windows of a recording.
 
-    Poses and a depth move each event of a window to the place where the camera saw its edge in mid-window. A plane sweep
-    (`scene.depth_range`) finds the depth of each tile (16 grid pixels a side): the one at which the tile's events are
-    sharpest. It is found anew for each hypothesis, so that each hypothesis has the depths that serve it best. Sharpness
-    is the variance of the image of moved events (Gallego et al., "A Unifying Contrast Maximization Framework", CVPR
-    2018), summed over the pixels and divided by the number of events. All hypotheses are measured with the same events.
-    Events that leave the view, or go behind the camera, add nothing. Magnification does not count as sharpness.
+    Poses and a depth move each event of a window to the place where the camera saw its edge in mid-window. A plane
+    sweep (`scene.depth_range`) finds the depth of each tile (16 grid pixels a side): the one at which the tile's events
+    are sharpest. It is found anew for each hypothesis, so that each hypothesis has the depths that serve it best.
+    Sharpness is the variance of the image of moved events (Gallego et al., "A Unifying Contrast Maximization
+    Framework", CVPR 2018), summed over the pixels and divided by the number of events. All hypotheses are measured with
+    the same events. Events that leave the view, or go behind the camera, add nothing. Magnification does not count as
+    sharpness.
 
     Args:
         recording: Its index is made if it is not there yet.

@@ -16,7 +16,8 @@ from enerf_ns.dataparsers.recording.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 
 EVENTS_OF_EDGES = 0.05
-"""Number of events that are drawn onto a frame, as a share of the sensor's pixels. They are the nearest ones in time."""
+"""Number of events that are drawn onto a frame, as a share of the sensor's pixels. They are the nearest ones in
+time."""
 
 MAX_FRAMES = 24
 """Most frames that are compared with events."""
@@ -94,7 +95,8 @@ class FrameEdges:
         return found
 
     def best_plane(self, delays: Int64[np.ndarray, " delays"]) -> int:
-        """Number of the depth with the highest correlation, over every fourth frame and the best of some delays (ns)."""
+        """Number of the depth with the highest correlation, over every fourth frame and the best of some delays
+        (ns)."""
         if len(self.planes) == 1:
             return 0
         return int(np.argmax([self.likeness(delays, i, 4).mean(1).max() for i in range(len(self.planes))]))
@@ -125,7 +127,8 @@ class FrameEdges:
 
     @cached_property
     def _tables(self) -> list[Int64[np.ndarray, "height width"]]:
-        """For each plane, the place of each pixel of the event camera in the pictures: row * columns + column, or -1."""
+        """For each plane, the place of each pixel of the event camera in the pictures: row * columns + column, or
+        -1."""
         (columns, rows), seen = self._size, self.frames.camera.undistorted()
         time = torch.as_tensor(self.frames.times[0])
         events, frames = (owner.trajectory.poses(time).numpy() for owner in (self.recording, self.frames))

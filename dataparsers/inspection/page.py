@@ -117,7 +117,7 @@ class Inspection:
     sensor: SensorSurvey
     """Sensor parameters, stated and measured."""
     agreement: Agreement | None = None
-    """How well clocks, poses and focal length agree with the events. None if there are too few events."""
+    """Agreement of clocks, poses and focal length with the events. None if there are too few events."""
     as_stated: Agreement | None = None
     """The same with the clocks, poses and focal length as stated. None unless a training refined them."""
 
@@ -212,7 +212,8 @@ class Inspection:
             _, scale, box = scene_normalisation(recording, near, far)
             sides = " x ".join(f"{side:.3g}" for side in (box[1] - box[0]) / scale)
             rows["near and far"] = f"{near:.3g} m and {far:.3g} m, {source}"
-            rows["beyond"] = f"{percent(share_beyond(recording, self.depth_range))} of the events come from beyond the farthest depth"
+            beyond = percent(share_beyond(recording, self.depth_range))
+            rows["beyond"] = f"{beyond} of the events come from beyond the farthest depth"
             rows["box"] = f"{sides} m, around all that the camera sees; 1 m is {scale:.3g} units in Nerfstudio"
         else:
             rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
@@ -368,7 +369,8 @@ class Inspection:
         return figure
 
     def _path(self, number: int) -> tuple[Int64[np.ndarray, " number"], Float64[np.ndarray, "number 3 4"]]:
-        """Evenly spaced times (ns) from the first event to the last, and the poses, which are NaN in gaps of the poses."""
+        """Evenly spaced times (ns) from the first event to the last, and the poses, which are NaN in gaps of the
+        poses."""
         first, last = self.statistics.edges[[0, -1]]
         times = evenly_spaced(first, last, number)
         poses = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()
@@ -513,7 +515,6 @@ def _extrinsics(recording: EventRecording, frames: Frames) -> str:
         f"frame camera {x:.1f} mm right of, {y:.1f} mm below and {z:.1f} mm in front of the event camera, "
         f"turned by {math.degrees(turn):.2g} degrees"
     )
-
 
 
 def _plot(figure: Figure) -> str:

@@ -71,8 +71,8 @@ MIN_EVENTS_PER_PIXEL = 10
 """Fewest events per pixel on average, about a few grey levels. Recordings of publications have dozens."""
 
 MIN_SHARE_AT_CUT = 0.2
-"""Events in the last two columns (or rows) up to 255, as a share of the median column, above which the coordinate is cut
-to 8 bits. Fewer events may end at the border of the scene."""
+"""Events in the last two columns (or rows) up to 255, as a share of the median column, above which the coordinate is
+cut to 8 bits. Fewer events may end at the border of the scene."""
 
 FLOAT_TIMES, FEWEST_FLOAT_TIMES = 2**16, 100
 """Number of event times that are tested for single precision, and fewest different ones among them."""
@@ -104,9 +104,9 @@ class Problem:
     """Something about a recording that makes learning from it worse, or impossible."""
 
     what: str
-    """What was found, with numbers; one sentence."""
+    """The finding with its numbers, in one sentence."""
     advice: str
-    """What to do about it; one sentence."""
+    """Advice on what to do, in one or two sentences."""
 
 
 @dataclass(frozen=True)

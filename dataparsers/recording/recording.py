@@ -388,7 +388,8 @@ class EventRecording:
 
     @property
     def camera_frames(self) -> Frames | None:
-        """Frames that a camera took: the sharp ones, else the blurred ones, unless those are reconstructed from events."""
+        """Frames that a camera took: the sharp ones, else the blurred ones, unless those are reconstructed from
+        events."""
         return self.frames or (self.blurred_frames if self.reconstructed_by is None else None)
 
     def locate(self, index: int) -> str:

@@ -63,7 +63,8 @@ class Parallax:
     depths: Float64[np.ndarray, " tiles"]
     """Depths along the optical axis, metres, of all tiles whose votes have a clear peak at one plane."""
     num_by_chance: int
-    """Number of tiles with a clear peak behind the camera, where nothing is seen. About as many of `depths` are wrong."""
+    """Number of tiles with a clear peak behind the camera, where nothing is seen. About as many of `depths` are
+    wrong."""
     num_at_infinity: int
     """Number of tiles with a clear peak at infinity, which the camera's rotation alone explains."""
     extent: float
@@ -144,13 +145,13 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
     """Depths at which the event camera saw the scene, and how many of them are chance.
 
     This is a plane sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018). The viewing rays of the
-    events of an edge meet at the edge. Planes parallel to the image of a reference view, evenly spaced in disparity, cut
-    the rays from within half a baseline of that view. Each cut is a vote in the grid of the view. The dispersion
+    events of an edge meet at the edge. Planes parallel to the image of a reference view, evenly spaced in disparity,
+    cut the rays from within half a baseline of that view. Each cut is a vote in the grid of the view. The dispersion
     (variance over mean) of the votes in a tile peaks at the plane where the rays meet. The variance is the objective of
     Gallego et al., "A Unifying Contrast Maximization Framework", CVPR 2018. The unit of length has no influence:
     baselines are the extent of the camera's path and its halvings. The same planes behind the camera, where rays of a
-    scene never meet, are the control. Without parallax, or with noise of the poses alone, there are as many peaks behind
-    the camera as in front.
+    scene never meet, are the control. Without parallax, or with noise of the poses alone, there are as many peaks
+    behind the camera as in front.
 
     Args:
         events: In time order, within the span of the trajectory.
@@ -174,8 +175,8 @@ def measure_share_beyond(
 ) -> float:
     """Share of the events that come from beyond a depth range, from 0 to 1.
 
-    This is the plane sweep of `measure_parallax`, at the baseline that places the farthest depth FARTHEST_DISPARITY from
-    infinity. A tile's votes lie beyond if their dispersion is larger at some plane between the farthest depth and
+    This is the plane sweep of `measure_parallax`, at the baseline that places the farthest depth FARTHEST_DISPARITY
+    from infinity. A tile's votes lie beyond if their dispersion is larger at some plane between the farthest depth and
     infinity than at all planes of the range. Noise favours the range, which has more planes.
 
     Args:
@@ -221,8 +222,8 @@ def _sweeps(
     baselines: Iterable[float],
     disparities: Float64[np.ndarray, " planes"],
 ) -> Iterator[tuple[float, Float64[np.ndarray, "2 planes tiles"]]]:
-    """Each baseline (metres) with the result of `sweep_planes` for each of its reference views. Nothing for a camera that
-    stays in one place."""
+    """Each baseline (metres) with the result of `sweep_planes` for each of its reference views. Nothing for a camera
+    that stays in one place."""
     if not _extent(path[1]):
         return
     directions, generator = camera.pixel_directions(), np.random.default_rng(0)
@@ -256,7 +257,8 @@ def grid_scale(camera: Camera) -> float:
 
 
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
-    """Numbers of the events around a time (ns) while the camera is within a radius (metres) of its place at that time."""
+    """Numbers of the events around a time (ns) while the camera is within a radius (metres) of its place at that
+    time."""
     now = np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1)
     outside = np.flatnonzero(np.linalg.norm(path - path[now], axis=1) > radius)
     limits = np.concatenate([[0], outside, [len(path_times) - 1]])

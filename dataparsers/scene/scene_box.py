@@ -12,7 +12,8 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 def scene_normalisation(
     recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Transform and scale from the world to the scene, and the box of all that the event camera sees in the depth range.
+    """Transform and scale from the world to the scene, and the box of all that the event camera sees in the depth
+    range.
 
     Args:
         recording: Its camera is placed at all poses that are used.
@@ -22,9 +23,9 @@ def scene_normalisation(
             Default: the box of all that the camera sees.
 
     Returns:
-        transform (3, 4) and scale: a world point p lies at scale * (transform @ [p, 1]) in the scene. The transform turns
-        the mean up direction of the cameras to +z, and moves the middle of the box to the origin. The box (2, 3) is in
-        scene units, and its longest side is 2. With a cube, the transform does not turn the world.
+        transform (3, 4) and scale: a world point p lies at scale * (transform @ [p, 1]) in the scene. The transform
+        turns the mean up direction of the cameras to +z, and moves the middle of the box to the origin. The box (2, 3)
+        is in scene units, and its longest side is 2. With a cube, the transform does not turn the world.
     """
     if cube is not None:
         return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])

@@ -1,4 +1,4 @@
-"""Clocks, poses and focal length that events contradict are named, and those that they cannot contradict are not."""
+"""Clocks, poses and focal lengths that contradict the events are reported, and no others."""
 
 from __future__ import annotations
 
@@ -71,8 +71,10 @@ def words(found: Agreement) -> str:
     return " ".join(problem.what + " " + problem.advice for problem in found.problems())
 
 
-@pytest.mark.parametrize("top, is_identifiable", [(0, True), (30, True), (-44, True), (-48, False), (49, False), (-200, False)])
-def test_a_delay_that_may_lie_beyond_those_that_are_tried_is_not_told(top: float, is_identifiable: bool):
+@pytest.mark.parametrize(
+    "top, is_identifiable", [(0, True), (30, True), (-44, True), (-48, False), (49, False), (-200, False)]
+)
+def test_a_delay_at_the_end_of_the_search_is_not_identifiable(top: float, is_identifiable: bool):
     """As of a camera that slides evenly, whose events grow ever sharper towards one end, but for noise."""
 
     def curve(delays: np.ndarray) -> np.ndarray:
@@ -94,7 +96,7 @@ def test_the_best_delay_of_the_poses_is_the_true_one(shaken: EventRecording, lat
 
 @pytest.mark.parametrize("factor", [0.92, 1.1])
 def test_the_best_focal_length_is_the_true_one(factor: float):
-    """Turning tells it: by 9 degrees here."""
+    """The camera turns, by 9 degrees, which makes it identifiable."""
     turning = Rotation.from_rotvec(2.5 * TURNING.as_rotvec())
     found = agreement(faults.longer_focal_length(points_seen(shaking(0.1), turning), factor))
     assert found.focal_scale.is_identifiable and found.focal_scale.value == pytest.approx(1 / factor, abs=0.02)
@@ -144,12 +146,14 @@ def test_poses_of_a_body_are_reread_before_the_camera_is_mounted(shaken: EventRe
     assert [reading.words for reading in found.readings] == ["quaternions in the order w x y z"]
 
 
-def test_what_a_steady_slide_does_not_tell_is_said():
+def test_a_steady_slide_identifies_neither_clock_nor_focal_length():
     """At one speed a clock's delay moves the world alone, without turning a focal length trades with depth, and a half
     turn about the direction of motion changes nothing."""
     found = agreement(points_seen((PHASE / np.pi - 1) * [0.3, 0, 0], STILL))
     assert not found.pose_delay.is_identifiable and not found.problems()
-    assert found.verdict().endswith("the clock of the poses and the focal length are not identifiable from this recording")
+    assert found.verdict().endswith(
+        "the clock of the poses and the focal length are not identifiable from this recording"
+    )
     assert found.rows()["equally sharp"].startswith("OpenGL's camera axes")
 
 
@@ -247,7 +251,7 @@ def test_slider_depth_is_sound(slider: EventRecording):
 def test_clocks_of_slider_depth(
     slider: EventRecording, fault: Callable[[EventRecording, int], EventRecording], late: int
 ):
-    """What tells the clock of its poses is where it turns back at its end."""
+    """The clock of its poses is identifiable because the slider turns back at its end."""
     sound, found = agreement(slider), agreement(fault(slider, late))
     assert sound.frame_delay and found.frame_delay
     moved = found.pose_delay.value - sound.pose_delay.value, found.frame_delay.value - sound.frame_delay.value
@@ -269,14 +273,14 @@ def test_clocks_of_slider_depth(
 def test_conventions_of_slider_depth(
     slider: EventRecording, fault: Callable[[EventRecording], EventRecording], named: str
 ):
-    """It slides without turning: several readings that point it the same way cannot be told apart."""
+    """It slides without turning: several readings that point it the same way are equally sharp."""
     found = words(agreement(fault(slider)))
     assert named in found and "this motion" in found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.1, 1.7])
-def test_focal_length_of_slider_depth_cannot_be_told(slider: EventRecording, factor: float):
+def test_focal_length_of_slider_depth_is_not_identifiable(slider: EventRecording, factor: float):
     found = agreement(faults.longer_focal_length(slider, factor))
     assert not found.focal_scale.is_identifiable and "focal length is not identifiable" in found.verdict()
     assert found.corners is not None and not found.corners.focal_scale.is_identifiable

@@ -47,13 +47,13 @@ def test_points_are_where_they_can_be(positions: np.ndarray):
     assert tracks.reprojection_errors(0.9, 1.0, 10**8)[0].mean() > 1.0
 
 
-def test_a_miss_is_a_distance_in_pixels():
+def test_a_reprojection_error_is_a_distance_in_pixels():
     off = np.array([3.0, -4.0])
     assert seen(STILL, off).reprojection_errors(0.9)[0] == pytest.approx(np.full(50, 5.0))
 
 
-def test_along_its_line_a_point_is_not_missed_but_beyond_its_end():
-    """The least depth ends the line: a nearer point is missed by what it went further than one at that depth."""
+def test_a_point_on_its_epipolar_line_has_no_error_but_one_beyond_its_end_has():
+    """The least depth ends the line: the error of a nearer point is the distance to a point at that depth."""
     tracks = seen(MOVED, np.zeros(2))
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 3.0], (50, 3))
     turn = TURNS[1].inv()

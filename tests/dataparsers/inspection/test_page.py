@@ -153,7 +153,7 @@ def test_one_problem_is_not_two(tmp_path: Path):
     assert "1 problem\n" in page.text and inspection.problems[1].what not in page.text
 
 
-def test_no_problems_are_said_to_be_none(tmp_path: Path):
+def test_the_absence_of_problems_is_stated(tmp_path: Path):
     inspection = replace(Inspection.of(read_recording(write_esim(tmp_path / "esim"))), problems=[])
     assert "No problems were found." in Page(inspection.page()).text
     assert "No problems were found." in shown_in_terminal(inspection)
@@ -192,7 +192,9 @@ def test_numbers_of_a_small_recording(tmp_path: Path):
     assert found["events"] == "6, 0.110 s to 0.900 s"
     assert found["poses"] == "11, 0.000 s to 1.000 s, usually every 100 ms"
     assert found["frames"] == "3, 0.150 s to 0.750 s, with depth"
-    assert found["event camera"] == "24 x 18 pixels, pinhole, field of view 62 x 48 degrees"  # 2 atan(12 / 20), 2 atan(9 / 20)
+    assert (
+        found["event camera"] == "24 x 18 pixels, pinhole, field of view 62 x 48 degrees"
+    )  # 2 atan(12 / 20), 2 atan(9 / 20)
     assert found["frame camera"] == "the same"
     sensor = inspection.sensor.rows()
     assert sensor["thresholds"].startswith("C_on = 0.5 ± ") and sensor["refractory"] == "the events show none"

@@ -188,7 +188,7 @@ def test_a_recording_without_frames_needs_none():
 
 
 def test_events_of_one_instant_alone_are_counted():
-    """Fewer than tell that the times are in another unit."""
+    """There are too few events to find that the times are in another unit."""
     events = good_events(np.random.default_rng(0), 900)
     events[:, 2] = SECOND
     recording = made(events)
