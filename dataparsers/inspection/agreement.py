@@ -304,11 +304,13 @@ class Agreement:
         if self.corners is not None:
             fit, scale = self.corners, self.corners.focal_scale
             rows["focal length by frames"] = f"reprojection error of corners {fit.error:.2f} pixels" + (
-                f", {fit.least_error:.2f} with the best, {scale.value:.3f} ± {scale.error:.3f} of the stated one"
+                f"; {fit.least_error:.2f} pixels with the best focal length, {scale.value:.3f} ± {scale.error:.3f} of "
+                "the stated one"
                 if scale.is_identifiable
-                else ", which does not identify it"
+                else ", which does not identify the focal length"
             )
-        rows["sharpness"] = "; ".join(f"{name}: {value}" for name, value in self.shown().items())
+        shown = "; ".join(f"{name}: {value}" for name, value in self.shown().items())
+        rows["sharpness"] = f"as stated: 100 %; {shown}"
         return rows
 
     def shown(self) -> dict[str, str]:

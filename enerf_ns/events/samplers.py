@@ -386,10 +386,6 @@ class InstantPairSampler:
         self.start_ns, self.end_ns = start_ns, end_ns
         self.max_duration_ns = min(max_duration_ns, max(end_ns - start_ns, 1))
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
-        self._stretches = None
-        if stretches is not None:
-            used = stretches[(stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)]
-            self._stretches = used.clamp(start_ns, end_ns)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
         """Draws `batch_size` pairs by a generator on the device of the index."""
@@ -398,9 +394,10 @@ class InstantPairSampler:
         other = one + _randint(steps, generator) - self.max_duration_ns
         other = torch.where(other < self.start_ns, 2 * self.start_ns - other, other)
         other = torch.where(other > self.end_ns, 2 * self.end_ns - other, other)
-        if self._stretches is not None:
-            part = _part(other, self._stretches)
-            following = torch.cat([self._stretches[:, 0], self._stretches[-1:, 1]])
+        stretches = self._moments.stretches
+        if stretches is not None:
+            part = _part(other, stretches)
+            following = torch.cat([stretches[:, 0], stretches[-1:, 1]])
             other = torch.where(part % 2 == 0, following[part // 2], other)
         start, end = torch.minimum(one, other), torch.maximum(one, other)
         begin = self.index.offsets[pixels]
@@ -506,27 +503,27 @@ class _PixelMoments:
         usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
         usable[index.hot_pixels] = False
         self._pixels = usable.nonzero()[:, 0]
-        self._stretches = None
+        self.stretches = stretches
+        """The stretches between `start_ns` and `end_ns`. None: all of the time."""
         if stretches is not None:
-            begins, ends = stretches.clamp(start_ns, end_ns).T
             used = (stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)
             if not used.any():
                 raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
-            begins, ends = begins[used], ends[used]
-            after = (ends - begins + 1).cumsum(0)
-            self._stretches = begins, ends, after, int(after[-1])
+            self.stretches = stretches[used].clamp(start_ns, end_ns)
+            self._after = (self.stretches.diff(dim=1)[:, 0] + 1).cumsum(0)
+            self._total = int(self._after[-1])
 
     def draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | int, Tensor | int]:
         """Random pixels, random instants, and the first and the last instant of the stretch around each instant."""
         device = self._pixels.device
         pixels = self._pixels[torch.randint(len(self._pixels), (number,), generator=generator, device=device)]
-        if self._stretches is None:
+        if self.stretches is None:
             instant = torch.randint(self.start_ns, self.end_ns + 1, (number,), generator=generator, device=device)
             return pixels, instant, self.start_ns, self.end_ns
-        begins, ends, after, total = self._stretches
-        place = torch.randint(total, (number,), generator=generator, device=device)
-        stretch = torch.searchsorted(after, place, right=True)
-        return pixels, ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
+        place = torch.randint(self._total, (number,), generator=generator, device=device)
+        stretch = torch.searchsorted(self._after, place, right=True)
+        begin, end = self.stretches[stretch].T
+        return pixels, end + 1 - (self._after[stretch] - place), begin, end
 
 
 class _Draws:
