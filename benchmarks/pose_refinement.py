@@ -247,8 +247,8 @@ def sharpest(folder: Path) -> dict[str, Any]:
         return {}
     delay, scale = found
     return {
-        "pipeline.poses.clock_ms": delay.value if delay.is_told else 0.0,
-        "pipeline.poses.focal_scale": scale.value if scale.is_told else 1.0,
+        "pipeline.poses.clock_ms": delay.value if delay.is_identifiable else 0.0,
+        "pipeline.poses.focal_scale": scale.value if scale.is_identifiable else 1.0,
     }
 
 

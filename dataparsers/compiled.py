@@ -1,4 +1,4 @@
-"""Functions compiled to machine code."""
+"""Compilation of functions to machine code."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 
 @cache
 def compiled(function: Callable, any_order: bool = False) -> Callable:
-    """The function compiled by Numba when it is first called: without the GIL, dividing as NumPy does, and kept on disk
-    for the next process where there is a folder to write it to.
+    """The function, compiled by Numba at its first call.
+
+    It runs without the GIL, divides by zero as NumPy does, and is stored on disk for the next process if there is a
+    folder to write to.
 
     Args:
-        function: What Numba can compile.
-        any_order: Sums may be taken in any order, and products added to them unrounded, as vector instructions do.
+        function: A function that Numba can compile.
+        any_order: Let sums be taken in any order, and products be added unrounded, as vector instructions do.
     """
     import numba  # here, since importing it takes longer than reading a small recording
 
@@ -23,5 +25,5 @@ def compiled(function: Callable, any_order: bool = False) -> Callable:
         options["fastmath"] = {"reassoc", "contract"}
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # there is no such folder
+    except RuntimeError:  # there is no folder to write to
         return numba.njit(**options)(function)

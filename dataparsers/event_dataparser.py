@@ -35,75 +35,78 @@ from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_c
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
-with warnings.catch_warnings(), suppress(ImportError):  # of which Nerfstudio would show two at each start
+with warnings.catch_warnings(), suppress(ImportError):  # hides two warnings that Nerfstudio would show at each start
     warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.custom_", FutureWarning)
     import_module("nerfstudio.field_components.activations")
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
-"""Turns the camera axes x right, y down, z forward into Nerfstudio's x right, y up, z back, and back again."""
+"""Rotation from the camera axes x right, y down, z forward to Nerfstudio's x right, y up, z back. It is its own
+inverse."""
 
 DEFAULT_HELD_OUT_EVERY = 4
-"""Number of frames of which one is held out, where nothing else is set."""
+"""One frame in so many is held out by default."""
 
 NUM_EVENT_PICTURES = 48
-"""Cameras along the trajectory that stand in for frames where a recording has none."""
+"""Number of cameras along the trajectory that stand in for frames if a recording has none."""
 
 
 @dataclass
 class EventDataParserConfig(DataParserConfig):
-    """A recording of an event camera; finds out which format the folder has."""
+    """A recording of an event camera, in any format that enerf-ns reads."""
 
     _target: Type = field(default_factory=lambda: EventDataParser)  # noqa: UP006
     data: Path = Path()
     """Folder of the recording. It is only ever read."""
     held_out_every: Optional[int] = None  # noqa: UP045
-    """Every so many frames one is kept from training, for evaluation. 1: all, for learning from events alone. None: 4,
-    unless a preset selects frames."""
+    """One frame in so many is held out for evaluation. 1: all frames, to learn from events alone. Default: 4, unless a
+    preset selects frames."""
     train_frames: Optional[Literal["blurred", "sharp"]] = None  # noqa: UP045
-    """Which frames to train on, where the recording has both; evaluation is always on sharp ones. None: blurred ones
-    for the methods of enerf-ns; for all others sharp ones, or those that were reconstructed from events."""
+    """Frames to train on, if the recording has both. Evaluation always uses sharp frames. Default: blurred frames for
+    the methods of enerf-ns; for other methods sharp frames, or frames that were reconstructed from events."""
     exposure_ms: Optional[float] = None  # noqa: UP045
-    """How long the frames to train on were exposed, half of it before and half after their stamps; 0 for an instant.
-    None: the recording's own."""
+    """Exposure time of the frames to train on, milliseconds. Half of it lies before the frame's stamp, half after.
+    0: an instant. Default: the recording's own exposure."""
     depth_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
-    """Nearest and farthest depth of the scene in metres. None: the recording's own, else measured from its events."""
+    """Nearest and farthest depth of the scene, metres. Default: the recording's own range, else measured from
+    events."""
     box: Optional[Tuple[float, float, float, float]] = None  # noqa: UP006, UP045
-    """Cube around the scene: x y z of its middle and half its side, metres. None: all that the cameras see."""
+    """Cube around the scene: x y z of its middle and half its side, metres. Default: the box of all that the cameras
+    see."""
     time_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
-    """First and last second that is used, on the recording's clock. None: all."""
+    """First and last second to use, on the recording's clock. Default: the whole recording."""
     keep_hot_pixels: bool = False
     """Use pixels that fire far more often than their neighbourhood."""
     keep_pose_gaps: bool = False
-    """Use what lies in gaps between poses, which are guesses there."""
+    """Use events and frames in gaps of the poses, with interpolated poses."""
     downscale_factor: Optional[float] = None  # noqa: UP045
-    """How many times smaller than the frames their pictures are; events stay as they are. None: 1."""
+    """Factor by which pictures are smaller than the frames. Events stay as they are. Default: 1."""
     smooth_poses: Optional[bool] = None  # noqa: UP045
-    """Take noise that is independent from pose to pose off the poses. None: where it moves the picture by more than a
+    """Smooth noise of the poses that is independent from pose to pose. Default: if it moves the picture by more than a
     tenth of a pixel."""
     undistort: bool = True
-    """Undo the distortion of the lenses that the calibration states. False: as if there were none."""
+    """Undo the lens distortion that the calibration states. False: ignore it, as if the lens had none."""
     train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
-    """Numbers of the frames to train on, from 0. None: all that are not held out."""
+    """Numbers of the frames to train on, from 0. Default: all frames that are not held out."""
     held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
-    """Numbers of the frames kept for evaluation, from 0. None: by held-out-every."""
+    """Numbers of the frames to hold out for evaluation, from 0. Default: those that held-out-every selects."""
     format: Suppress[str] = "auto"
-    """Name of a registered format, or auto to find out; what a sub-command stands for."""
+    """Name of a registered format, or auto to detect it. Each sub-command sets its format."""
     picture_files: Suppress[bool] = True
-    """Write pictures that any method reads; the methods of enerf-ns read what a recording has, frames or events."""
-    options: Annotated[FormatOptions, tyro.conf.arg(name="")] = FormatOptions()  # noqa: RUF009 - frozen
-    """Options of the format. A default and no default_factory, so that runs of before there were any can be loaded."""
+    """Write picture files that any method reads. The methods of enerf-ns read the recording itself."""
+    options: Annotated[FormatOptions, tyro.conf.arg(name="")] = field(default_factory=FormatOptions)
+    """Options of the format."""
 
 
 @dataclass
 class EventDataParser(DataParser):
-    """Turns a recording into cameras in a box of size 2 around the origin, z up, and pictures that any method reads."""
+    """Converts a recording to cameras in a box of size 2 around the origin, with z up, and pictures for any method."""
 
     config: EventDataParserConfig
 
     def recording(self) -> EventRecording:
         """The recording of this parser's folder, read once per process."""
         config = self.config
-        time_range = config.time_range and (config.time_range[0], config.time_range[1])  # a list, from some YAML
+        time_range = config.time_range and (config.time_range[0], config.time_range[1])  # YAML may give a list
         selection = (
             *(time_range, config.keep_hot_pixels, config.keep_pose_gaps, config.undistort),
             bool(config.smooth_poses),
@@ -119,26 +122,25 @@ class EventDataParser(DataParser):
                 return self.outputs(recording, split)
             if not recording.has_frames:
                 raise RecordingError(
-                    f"{recording.path} holds no frames to train on, from which this method learns; learn from its "
-                    f"events with ns-train enerf --data {quoted(recording.path)}, or make frames of them with enerf "
+                    f"{recording.path} holds no frames to train on, but this method needs some; learn from its events "
+                    f"with ns-train enerf --data {quoted(recording.path)}, or make frames from events with enerf "
                     f"reconstruct {quoted(recording.path)} --output-dir NEW and give that folder."
                 )
             return with_picture_files(self.outputs(recording, split))
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
-        """Cameras of one split, and the box, as Nerfstudio wants them; the file names are those of the recording.
+        """Nerfstudio's outputs for one split: its cameras, the scene box, and the recording's file names.
 
-        The metadata hold the recording; the frames, and whether they are some, as of `split_frames`; and transform,
-        the float64 original of `dataparser_transform`, since float32 is 0.25 m coarse 5e6 m from the world's origin.
+        The metadata hold the recording, the two results of `split_frames` as frames and are_frames, and transform, the
+        float64 original of `dataparser_transform`. Float32 has a resolution of 0.25 m at 5e6 m from the world's origin.
 
         Args:
-            recording: What was read.
-            split: "train", or "val" and "test", which are the held-out frames.
+            recording: From `recording()`.
+            split: "train", or "val" or "test" for the held-out frames.
 
         Raises:
-            RecordingError: The depth of the scene is neither known nor observable, or all frames lie in gaps of the
-                poses.
-            FlagError: The frames cannot be downscaled so far.
+            RecordingError: The depth range is neither stated nor measurable, or all frames lie in gaps of the poses.
+            FlagError: The frames cannot be downscaled by this factor.
         """
         near, far = scene_depth_range(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
@@ -164,7 +166,7 @@ def scene_cameras(frames: Frames, transform: Float64[torch.Tensor, "3 4"], scale
 
     Args:
         frames: In the recording's world.
-        transform, scale: Of the scene, as of `PosedCamera`.
+        transform, scale: From `scene_normalisation`.
     """
     rotation, shift = transform[:, :3].numpy(), transform[:, 3].numpy()
     poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
@@ -186,25 +188,24 @@ def scene_cameras(frames: Frames, transform: Float64[torch.Tensor, "3 4"], scale
 
 
 class EventDataparserOutputs(DataparserOutputs):
-    """Those of Nerfstudio, of which files are whole or not there."""
+    """Nerfstudio's outputs, which write their file as a whole or not at all."""
 
     def save_dataparser_transform(self, path: Path) -> None:
-        """Writes `transform` and `scale`, by which world coordinates become those of the field, as JSON.
+        """Writes the transform and the scale from world to scene coordinates, as JSON.
 
         Raises:
-            OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+            OSError: The disk is full, or the folder cannot be written to. No file is left then.
         """
         values = {"transform": self.dataparser_transform.tolist(), "scale": float(self.dataparser_scale)}
         write_whole(path, json.dumps(values, indent=4))
 
 
 def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:
-    """What methods that know nothing of recordings can read: pictures, and depth, in files that fit the cameras.
+    """The outputs with files that any method reads: pictures, and depth maps, that fit the cameras.
 
-    The pictures are written to the cache, undistorted and downscaled as the cameras state, with 8 bits and without
-    transparency, since each of Nerfstudio's data sets opens files by itself: neither all of them undistort, nor is
-    every lens one that Nerfstudio's cameras can state, and some write beside the pictures, which must not be the
-    recording.
+    The pictures are written to the cache, undistorted and downscaled, with 8 bits and without transparency.
+    Nerfstudio's data sets open files themselves, and not all of them undistort. Nerfstudio's cameras cannot state every
+    lens. Some methods write files beside the pictures, which must not happen in the recording.
 
     Raises:
         RecordingError: A file cannot be read.
@@ -218,17 +219,17 @@ def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
-    """The frames of one split; where the recording has none, instants along its trajectory to picture events at.
+    """The frames of one split, or instants along the trajectory if the recording has no frames.
 
-    Which frames are held out does not depend on those to train on, so that all methods are scored on the same.
+    The held-out frames do not depend on the frames to train on, so that all methods are scored on the same frames.
 
     Returns:
-        The frames, without those in gaps of the poses, nor, to train on, those whose exposures reach beyond the poses
-        or into gaps; and whether they are some: otherwise, their file names stand for no files.
+        The frames, without those in gaps of the poses. Frames to train on are also without those whose exposures reach
+        beyond the poses or into gaps. And whether the frames are files: otherwise, their file names stand for no files.
 
     Raises:
-        RecordingError: None is left.
-        FlagError: The exposure, or the downscaling, that is set is none that the frames can have.
+        RecordingError: No frame is left.
+        FlagError: The exposure or the downscaling is impossible for the frames.
     """
     frames, are_frames = _split_frames(recording, config, held_out)
     if config.downscale_factor is None:
@@ -292,14 +293,14 @@ def _split_frames(recording: EventRecording, config: EventDataParserConfig, held
 
 
 def event_pictures(recording: EventRecording) -> Frames:
-    """Instants along the trajectory, for a recording without frames; their file names stand for no file."""
+    """Instants along the trajectory, for a recording without frames. Their file names stand for no files."""
     times = recording.instants(NUM_EVENT_PICTURES + 2)[1:-1]
     names = tuple(recording.path / f"events_{i:05d}.png" for i in range(len(times)))
     return Frames(filenames=names, times=times, camera=recording.camera, trajectory=recording.trajectory)
 
 
 def specification(format: Format) -> DataParserSpecification:
-    """The sub-command of a format, to be named as an entry point in the group nerfstudio.dataparser_configs."""
+    """The sub-command of a format, for an entry point in the group nerfstudio.dataparser_configs."""
     config = EventDataParserConfig(format=format.name, options=format.options())
     return DataParserSpecification(config=config, description=format.description)
 

@@ -1,4 +1,4 @@
-"""The per-pixel index of a recording's events, from which everything that looks at events draws."""
+"""The index of a recording's events by pixel, through which all other modules read events."""
 
 from __future__ import annotations
 
@@ -15,35 +15,34 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import Events
 
 EVENTS_IN_PICTURE = 0.2
-"""Events drawn into one picture, as a share of the sensor's pixels."""
+"""Most events in one picture, as a share of the sensor's pixels."""
 EVENTS_AT_ONCE = 2**22
-"""Events whose times are looked at together."""
+"""Events whose times are compared at once, which limits memory."""
 ON_COLOUR, OFF_COLOUR, NO_EVENT = (205, 50, 50), (50, 70, 205), (255, 255, 255)
-"""Colours of a picture where it became brighter, where darker, and where nothing fired; red, green, blue."""
+"""Colours (red, green, blue) of on events, of off events, and of pixels without events."""
 
 
 @dataclass(frozen=True)
 class EventIndex:
-    """Events sorted by pixel, then time; 12 bytes an event. Pixel (x, y) of a sensor is number y * width + x."""
+    """Events sorted by pixel, then by time, in 12 bytes per event. Pixel (x, y) has the number y * width + x."""
 
     times: Int64[Tensor, " events"]
-    """Time of each event, ns; never decreasing within a pixel."""
+    """Time of each event, ns. Times never decrease within a pixel."""
     positives: Int32[Tensor, " events"]
-    """Number of positive events up to and with each event, counted over the whole array: between two events i < j of
-    one pixel, (i, j] holds positives[j] - positives[i] positive ones, and the other j - i - that many are negative."""
+    """Running count of positive events over the whole array, each event included. Of the j - i events of a pixel after
+    event i, up to and with event j, positives[j] - positives[i] are positive, and the others are negative."""
     offsets: Int64[Tensor, " pixels+1"]
-    """Where the events of each pixel lie: those of pixel p are offsets[p] to offsets[p + 1] - 1."""
+    """First event of each pixel: pixel p has the events offsets[p] to offsets[p + 1] - 1."""
     width: int
     """Width of the sensor, pixels."""
     hot_pixels: Int64[Tensor, " hot"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
-    """Numbers of the pixels whose events were left out."""
+    """Numbers of the hot pixels, whose events are left out."""
     notes: tuple[str, ...] = ()
-    """What was left out of the recording's events, or could not be stored, one sentence each."""
+    """Sentences on events that were left out, or on an index that could not be stored."""
     share_outside_poses: float = 0.0
-    """Share of the recording's events that are left out because there are no poses."""
+    """Share of the recording's events that are left out because they lie outside the poses."""
     num_in_gaps: int = 0
-    """Number of the events within gaps of the poses. They count, but no pair starts or ends with them unless gaps are
-    kept."""
+    """Number of events in gaps of the poses. They count, but no pair starts or ends with them unless gaps are kept."""
 
     def __len__(self) -> int:
         return len(self.times)
@@ -57,7 +56,7 @@ class EventIndex:
             width, height: Of the sensor, pixels.
 
         Raises:
-            ValueError: An event outside the sensor, or 2^31 events and more.
+            ValueError: An event lies outside the sensor, or there are 2^31 events and more.
         """
         survey = survey_events(lambda: iter([events]), width, height, -(2**63), 2**63 - 1)
         if survey.outside is not None:
@@ -78,14 +77,14 @@ class EventIndex:
 
     @property
     def span(self) -> tuple[int, int]:
-        """Times of the first and of the last event, ns."""
+        """Times of the first and the last event, ns."""
         active = self.offsets.diff() > 0
         first, last = self.offsets[:-1][active], self.offsets[1:][active] - 1
         return int(self.times[first].min()), int(self.times[last].max())
 
     @property
     def num_positive(self) -> int:
-        """Number of positive events; the others are negative."""
+        """Number of positive events. The others are negative."""
         return int(self.positives[-1]) if len(self) else 0
 
     @cached_property
@@ -94,7 +93,7 @@ class EventIndex:
         return int(self.offsets.diff().max())
 
     def count_until(self, pixels: Int64[Tensor, "*batch"], times: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
-        """How many events each pixel fired at or before a time (ns), by binary search within the pixel."""
+        """Number of events that each pixel fired at or before a time (ns), by binary search within the pixel."""
         first, stop = self.offsets[pixels], self.offsets[pixels + 1]
         following = first
         for step in reversed(range(self._most_events.bit_length())):
@@ -104,16 +103,16 @@ class EventIndex:
         return following - first
 
     def events(self, at_most: int | None = None) -> Events:
-        """The events in time order; of equal times, the lower pixel number first. Polarity is ±1.
+        """The events in time order, and by pixel number at equal times. Polarity is ±1.
 
         Args:
-            at_most: Of more events than this, every second, third ... of each pixel is taken.
+            at_most: If there are more events than this, every second, third, … event is taken. Default: all.
         """
         step = 1 if at_most is None else max(-(-len(self) // at_most), 1)
         return self._in_time_order(torch.arange(0, len(self), step, device=self.times.device))
 
     def events_within(self, spans: Int64[np.ndarray, "spans 2"]) -> Events:
-        """The events at and between the ends (ns) of some spans of time, which may overlap; in order as `events`."""
+        """The events in some spans of time (ns), ends included, in the order of `events`. Spans may overlap."""
         begins, ends = (torch.from_numpy(side.copy()).sort().values for side in (spans[:, 0], spans[:, 1]))
         chosen = []
         for first in range(0, len(self), EVENTS_AT_ONCE):
@@ -134,15 +133,14 @@ class EventIndex:
 
 
 def event_picture(index: EventIndex, camera: Camera, time: int) -> UInt8[np.ndarray, "height width 3"]:
-    """The pixels that fired last before an instant, on white: red where it became brighter, blue where darker.
+    """An undistorted picture of the latest events up to an instant: on events in red, off events in blue, on white.
+
+    It shows the pixels that fired last, at most a fifth of all (`EVENTS_IN_PICTURE`).
 
     Args:
         index: On the CPU.
         camera: Of the events.
-        time: Instant in ns.
-
-    Returns:
-        Undistorted picture of a fifth of the sensor's pixels at most.
+        time: The instant, ns.
     """
     pixels = torch.arange(camera.width * camera.height)
     fired = index.count_until(pixels, torch.full_like(pixels, time))

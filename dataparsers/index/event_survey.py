@@ -1,4 +1,4 @@
-"""One pass over a recording's events: they are counted and checked; then they are sorted by pixel."""
+"""Counting, checking and sorting of a recording's events."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.recording.recording import Events
 
 HOT_RATIO = 10
-"""Factor by which a hot pixel fires more often than its neighbourhood's median; edges that pass stay far below."""
+"""Factor by which a hot pixel fires more often than the median of its neighbourhood. Edges of scenes stay far below."""
 
 HOT_FLOOR = 5
-"""Events that every neighbourhood is credited with, so that a few events in a plain region make no pixel hot."""
+"""Least median of a neighbourhood, so that a few events in an untextured region make no pixel hot."""
 
 
 @dataclass
 class Survey:
-    """What one pass over a recording's events finds out, before they are sorted."""
+    """Counts and faults of a recording's events, from one pass over them."""
 
     width: int
     start: int
@@ -32,36 +32,35 @@ class Survey:
     counts: Int32[np.ndarray, " pixels"]
     """Events of each pixel from start to end."""
     num_events: int = 0
-    """Number of events of the whole recording; of one with a faulty event, of the pieces before that event's."""
+    """Number of events of the whole recording. If there is a faulty event, of the pieces before it."""
     first: int = 0
     """Time of the first event of the recording, ns."""
     last: int = 0
     """Time of the last event of the recording, ns."""
     hot_pixels: Int64[np.ndarray, " hot"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Numbers of the pixels that are left out, found by `leave_out_hot_pixels`; their counts are 0."""
+    """Numbers of the hot pixels that `leave_out_hot_pixels` found. Their counts are 0."""
     num_hot_events: int = 0
-    """Number of events of the hot pixels that are left out."""
+    """Number of events of the hot pixels."""
     outside: int | None = None
-    """Number of the first event outside the sensor, at which the survey ends; None where there is none."""
+    """Number of the first event outside the sensor. The survey ends there. None if there is none."""
     backwards: int | None = None
-    """Number of the first event before its predecessor in time, at which the survey ends; None where there is none."""
+    """Number of the first event that is earlier than its predecessor. The survey ends there. None if there is none."""
     odd_polarity: int | None = None
-    """Number of the first event of a polarity that is neither of the two that the recording uses, at which the survey
-    ends; None where there is none."""
+    """Number of the first event of a third polarity. The survey ends there. None if there is none."""
     odd_event: tuple[int, int, int, int] = (0, 0, 0, 0)
-    """x, y, t and p of the event at which the survey ended."""
+    """x, y, t and p of the faulty event at which the survey ended."""
 
     @property
     def offsets(self) -> Int64[Tensor, " pixels+1"]:
-        """Offsets, as in `EventIndex`, of an index of the events that count."""
+        """The `EventIndex.offsets` of the events that count."""
         offsets = np.zeros(len(self.counts) + 1, np.int64)
         np.cumsum(self.counts, out=offsets[1:])
         return torch.from_numpy(offsets)
 
     def leave_out_hot_pixels(self, height: int) -> None:
-        """Find the pixels that fire far more often than their neighbourhood, and count none of their events.
+        """Finds the pixels that fire far more often than their neighbourhood, and sets their counts to 0.
 
-        The neighbourhood is 5 x 5 pixels; beyond the border, the pixel there is repeated.
+        The neighbourhood is 5 x 5 pixels. Beyond the border, the border's pixels are repeated.
         """
         hot = np.zeros(len(self.counts), bool)
         compiled(_find_hot)(self.counts, self.width, height, HOT_RATIO, HOT_FLOOR, hot)
@@ -71,14 +70,14 @@ class Survey:
 
 
 EventStream = Callable[[], Iterator[Events]]
-"""Function that starts again at the first event with every call, and gives the events in pieces."""
+"""Function that yields the events in pieces, from the first event on at each call."""
 
 
 def survey_events(stream: EventStream, width: int, height: int, start: int, end: int) -> Survey:
-    """Counts and checks the events of a recording, in one pass.
+    """Counts and checks the events of a recording in one pass, which ends at the first faulty event.
 
     Args:
-        stream: The events, of polarity {0, 1} or ±1.
+        stream: The events, with polarity {0, 1} or ±1.
         width, height: Of the sensor, pixels.
         start, end: First and last time (ns) whose events count.
     """
@@ -105,17 +104,17 @@ def survey_events(stream: EventStream, width: int, height: int, start: int, end:
 def sorted_bands(
     stream: EventStream, survey: Survey, max_events: int
 ) -> Iterator[tuple[Int64[np.ndarray, " band"], Int32[np.ndarray, " band"]]]:
-    """The times and running counts of positives of an index, in bands of consecutive pixels: a counting sort.
+    """Times and running counts of positive events for an index, in bands of consecutive pixels, by a counting sort.
 
-    Every band costs one pass over the events, and only one band is held in memory.
+    Each band takes one pass over the events. Only one band is in memory.
 
     Args:
         stream: The events that were surveyed.
         survey: Without faults.
-        max_events: That a band may hold, unless one pixel has more.
+        max_events: Most events of a band, unless one pixel has more.
 
     Raises:
-        ValueError: The events are not those that were surveyed.
+        ValueError: The events changed after the survey.
     """
     offsets = survey.offsets.numpy()
     keep = np.ones(len(survey.counts), bool)
@@ -143,7 +142,8 @@ def sorted_bands(
 
 
 def _narrow(column: Int[np.ndarray, " events"]) -> np.ndarray:
-    """A column as int32, so that the compiled loops meet one type; what is too large stays too large."""
+    """A column as int32, the one type of the compiled loops. Larger values become the largest int32, an error as
+    before."""
     if column.dtype.itemsize < 4 or column.dtype == np.int32:
         return column.astype(np.int32, copy=False)
     limits = np.iinfo(np.int32)
@@ -151,7 +151,7 @@ def _narrow(column: Int[np.ndarray, " events"]) -> np.ndarray:
 
 
 def _scan(x, y, t, p, width, height, start, end, counts, state):
-    """Adds events to the counts, and returns the kind and place of the first fault, or (0, 0)."""
+    """Adds events to the counts. Returns the kind and the place of the first fault, or (0, 0)."""
     for i in range(len(t)):
         if x[i] < 0 or x[i] >= width or y[i] < 0 or y[i] >= height:
             return 1, i
@@ -172,7 +172,7 @@ def _scan(x, y, t, p, width, height, start, end, counts, state):
 
 
 def _place(x, y, t, p, width, start, end, first, stop, keep, offsets, filled, times, positives):
-    """Puts the events of a band of pixels at their places; False where there are more than were counted."""
+    """Puts the events of a band of pixels at their places. Returns False if there are more than were counted."""
     for i in range(len(t)):
         pixel = np.int64(y[i]) * width + x[i]
         if first <= pixel < stop and keep[pixel] and start <= t[i] <= end:
@@ -186,10 +186,10 @@ def _place(x, y, t, p, width, start, end, first, stop, keep, offsets, filled, ti
 
 
 def _find_hot(counts, width, height, ratio, floor, hot):
-    """Marks pixels with more than `ratio` times the events of the median of 5 x 5 pixels, or of `floor`.
+    """Marks pixels with more than `ratio` times the median of 5 x 5 pixels, and more than `ratio` times `floor`.
 
-    The median lies below a bound where 13 of the 25 do. SciPy's `median_filter` finds the same pixels, but takes 20 to
-    120 times as long (0.4 s at 1280 x 720), since it does not stop at pixels that fire too seldom to be hot.
+    The median lies below a bound if 13 of the 25 pixels do. SciPy's `median_filter` finds the same pixels, but takes 20
+    to 120 times as long (0.4 s at 1280 x 720), since it also filters pixels that fire too seldom to be hot.
     """
     for pixel in range(width * height):
         if counts[pixel] > ratio * floor:

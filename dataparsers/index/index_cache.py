@@ -1,7 +1,7 @@
-"""Indices of events on disk, so that a large recording is sorted once.
+"""A cache of event indices on disk, so that a large recording is sorted once.
 
-An entry is a folder named after a hash of what the index was made from. It is written beside its place and then
-renamed, so that it is whole or not there, however many processes build it at once and wherever they are stopped.
+An entry is a folder. Its name is a hash of everything that determines the index. It is written under another name and
+then renamed, so that an entry is always whole, however many processes write it at once and whenever they are stopped.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from enerf_ns.dataparsers.index.event_survey import EventStream, Survey, sorted_
 from enerf_ns.dataparsers.recording.files import expanded, partial_of
 
 LAYOUT = 3
-"""Version of what is stored in an entry, counted up when that changes."""
+"""Version of an entry's content. It grows when the content changes."""
 
 CACHED_FROM = 2_000_000
-"""Number of events from which an index is stored; fewer are sorted again each time, which takes less than a second."""
+"""Fewest events of an index that is stored. Fewer events are sorted again each time, in less than a second."""
 
 COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
+"""Files of an entry, with the type of their numbers."""
 
 BLOCK = 2**22
 """Bytes that are read at once for a checksum."""
 
 
 def cache_folder() -> Path:
-    """Where the indices lie: $ENERF_CACHE, else `indices` in this package's folder in the user's cache folder.
+    """Folder of the indices: $ENERF_CACHE, else `enerf-ns/indices` in the user's cache folder.
 
     Raises:
         OSError: The user has no home folder.
@@ -51,7 +52,7 @@ def cache_folder() -> Path:
     unknown = FileNotFoundError(errno.ENOENT, "no home folder is known", "~")
     try:
         folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
-    except RuntimeError as error:  # of platformdirs from 4.9 on; before, the folder is one named ~
+    except RuntimeError as error:  # platformdirs from 4.9 on raises it; earlier ones return a folder named ~
         raise unknown from error
     if not folder.is_absolute():
         raise unknown
@@ -59,13 +60,13 @@ def cache_folder() -> Path:
 
 
 def entry_name(**made_from: object) -> str:
-    """Name of the entry for an index that is determined by these values (JSON types)."""
+    """Name of the entry of an index that these values (JSON types) determine."""
     text = json.dumps({"layout": LAYOUT, **made_from}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def load_index(name: str) -> tuple[EventIndex, Survey] | None:
-    """An index from the cache, mapped into memory; None where there is none. A damaged one is removed."""
+    """An index from the cache, mapped into memory, and its survey. None if there is none. Removes a damaged entry."""
     try:
         folder = cache_folder() / name
     except OSError:
@@ -89,19 +90,19 @@ def load_index(name: str) -> tuple[EventIndex, Survey] | None:
 
 
 def build_index(stream: EventStream, survey: Survey, name: str, notes: list[str]) -> EventIndex:
-    """Sorts the events, and stores the index in the cache where that pays.
+    """Sorts the events, and stores the index in the cache if there are at least `CACHED_FROM` events.
 
-    Of more events than a quarter of the memory holds, a band of pixels after the other is sorted and written.
+    If the events need more than a quarter of the memory, one band of pixels after the other is sorted and written.
 
     Args:
         stream: The events that were surveyed.
         survey: Without faults.
         name: Of the entry.
-        notes: Gets a sentence where the index could not be stored.
+        notes: A sentence is added if the index could not be stored.
 
     Raises:
-        OSError: The events do not fit into memory, and cannot be stored either.
-        ValueError: The events are not those that were surveyed.
+        OSError: The events need more than a quarter of the memory, and the index cannot be stored.
+        ValueError: The events changed after the survey.
     """
     num_events, in_memory = int(survey.counts.sum()), psutil.virtual_memory().total // 4 // 12
     bands = sorted_bands(stream, survey, in_memory)
@@ -148,7 +149,7 @@ def _store(name: str, survey: Survey, bands) -> None:
         try:
             partial.rename(cache_folder() / name)
         except OSError:
-            if load_index(name) is None:  # else another process was faster
+            if load_index(name) is None:  # otherwise another process was faster
                 raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -165,7 +166,7 @@ def _index(times: np.ndarray, positives: np.ndarray, survey: Survey) -> EventInd
 
 
 def _checksum(path: Path) -> list[int]:
-    """Size of a file, and the checksum of all of it."""
+    """Size and checksum of a file."""
     checksum = 0
     with open(path, "rb") as file:
         while block := file.read(BLOCK):

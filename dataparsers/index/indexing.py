@@ -1,4 +1,4 @@
-"""From a recording to the index of its events: read, checked, sorted, and kept on disk."""
+"""The index of a recording's events: read, checked, sorted and cached."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from enerf_ns.dataparsers.recording.recording import (
 )
 
 LARGEST_RATE = 2e9
-"""Events per second that no sensor can send; more of them means that times are in another unit than was thought."""
+"""Event rate (events per second) that no sensor can send. If it is higher, the unit of the times is wrong."""
 
 SILENT_SECONDS = 2.0
-"""Seconds that indexing goes on before a progress bar is shown."""
+"""Seconds of indexing before a progress bar is shown."""
 
 
 @cache
 def index_events(recording: EventRecording) -> EventIndex:
-    """All events of a recording's span, checked and sorted by pixel; found in the cache on disk, or made.
+    """All events in a recording's span, checked and sorted by pixel, from the cache on disk if they are there.
 
-    Reads all of the events, for minutes where there are many, and shows progress. Of one recording the index is made
-    once in a process.
+    Otherwise it reads all events, which takes minutes if there are many, and shows progress. It makes the index once
+    for each recording in a process.
 
     Args:
-        recording: As of `read_recording`.
+        recording: From `read_recording`.
 
     Raises:
-        RecordingError: No events, a coordinate outside the sensor, time that goes backwards, times in another unit
-            than those of the poses, a polarity other than {0, 1} or ±1, no events within the poses, or fewer than
-            two events at every pixel.
-        OutputError: More events than a quarter of the memory holds, and no room for their index on disk.
+        RecordingError: There are no events, a coordinate lies outside the sensor, time goes backwards, times have
+            another unit than those of the poses, a polarity is neither {0, 1} nor ±1, no events lie within the poses,
+            or no pixel has two events.
+        OutputError: The events need more than a quarter of the memory, and there is no room for their index on disk.
     """
     if recording.as_read is not None:
         return index_events(recording.as_read)
@@ -74,9 +74,10 @@ def index_events(recording: EventRecording) -> EventIndex:
             if survey.counts.max() < 2:
                 hot = len(survey.hot_pixels)
                 raise RecordingError(
-                    f"{recording.path} holds {survey.num_events:,} events, of which {survey.num_hot_events:,} are of "
-                    f"{hot:,} hot pixel{'s' * (hot > 1)}, with over 10 times as many as around, and no other pixel has "
-                    "two; keep them with --keep-hot-pixels True if they are no fault, else give another recording."
+                    f"{recording.path} holds {survey.num_events:,} events, of which {survey.num_hot_events:,} are from "
+                    f"{hot:,} hot pixel{'s' * (hot > 1)}, with over 10 times the events of the neighbourhood, "
+                    "and no other pixel has two; keep hot pixels with --keep-hot-pixels True if they are no fault, "
+                    "else give another recording."
                 )
         try:
             index = build_index(stream, survey, name, notes)
@@ -127,7 +128,7 @@ def _gap_notes(recording: EventRecording, num_events: int, total: int) -> Iterat
 
 
 def describe_gaps(gaps: Int64[np.ndarray, "gaps 2"]) -> str:
-    """What gaps of the poses (ns) there are, at least one."""
+    """The gaps of the poses (ns), at least one, in words."""
     begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
     lasts = f"{(end - begin) * 1e-9:.2f} s from {begin * 1e-9:.2f} s on"
     return f"a gap of the poses of {lasts}" if len(gaps) == 1 else f"{len(gaps)} gaps of the poses, the longest {lasts}"
@@ -179,11 +180,11 @@ def _check(recording: EventRecording, survey: Survey) -> None:
 
 
 def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
-    """The events of a stream; a progress bar shows how many of them have passed, once that takes long.
+    """A stream that shows a progress bar after `SILENT_SECONDS`.
 
     Args:
-        stream: To be called several times.
-        num_events: How many there are, where that is known.
+        stream: The events.
+        num_events: Number of events, if known.
     """
 
     def watched() -> Iterator[Events]:
@@ -196,7 +197,7 @@ def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
                 yield events
                 progress.advance(task, len(events))
                 if time.monotonic() - begin > SILENT_SECONDS:
-                    progress.start()  # nothing, once it has started
+                    progress.start()  # has no effect once it has started
         finally:
             if progress.live.is_started:
                 progress.stop()

@@ -1,4 +1,4 @@
-"""Frames as files that any program can open, undistorted; kept in the cache, so that each is made once."""
+"""Undistorted frames as files that any program can open, kept in the cache."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import Frames
 
 LAYOUT = 2
-"""Version of what is written, counted up when that changes."""
+"""Version of the pictures. It grows when their content changes."""
 
 
 def write_pictures(frames: Frames) -> list[Path]:
-    """Files of the pictures of frames, PNG of 8 bits in grey or colour, in a folder of the cache.
+    """Writes the pictures of frames to the cache, and returns their files: PNG of 8 bits, grey or colour.
 
-    The folder is named after a hash of the recording's folder and the cameras; a file has the name of its frame, and
-    its time of modification, by which it is known to be up to date.
+    The name of their folder is a hash of the recording's folder and the camera. A file has the name of its frame and
+    its time of modification. If both agree, it is up to date and not written again.
 
     Raises:
         RecordingError: A frame is missing or cannot be decoded.

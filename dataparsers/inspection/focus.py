@@ -1,4 +1,4 @@
-"""How sharp the events are once the camera's motion is taken out of them, whatever the poses may have meant."""
+"""Sharpness of motion-compensated events, under different hypotheses about poses and calibration."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from enerf_ns.dataparsers.scene.depth_range import (
     sweep_planes,
 )
 
-LARGEST_DELAY = 50_000_000
-"""Longest delay of a clock that is looked for, ns; a quarter of a shorter recording at most."""
+LONGEST_DELAY = 50_000_000
+"""Longest delay of a clock that is searched, ns. In a short recording it is a quarter of the recording."""
 
 PATH_OF_WINDOW = 0.09
-"""How far the picture moves within the window of time whose events are warped together, as a share of its width."""
+"""Distance that the picture moves within a window of time, as a share of the picture's width."""
 
 LONGEST_WINDOW = 1_000_000_000
-"""Longest window, ns, of a camera that hardly moves."""
+"""Longest window, ns, for a camera that hardly moves."""
 
 NUM_WINDOWS = 8
-"""Most windows: half of them spread evenly over the recording, half where the motion changes most."""
+"""Most windows. Half of them are spread evenly over the recording, half lie where the motion changes most."""
 
 EVENTS_PER_WINDOW = 25_000
 """Most events of a window by which hypotheses are compared, evenly taken."""
@@ -42,16 +42,17 @@ EVENTS_PER_PICTURE = 60_000
 """Most events that are drawn into a picture, evenly taken."""
 
 FEWEST_EVENTS = 2_000
-"""Fewest events of a window that say anything."""
+"""Fewest events of a window."""
 
 FEWEST_TILES = 12
 """Smallest sensor, in tiles."""
 
 PLANES = np.arange(0.0, 65.0)
-"""Planes of the sweep: grid pixels by which a point moves when the camera goes as far as it does in the window."""
+"""Planes of the sweep, as disparities: grid pixels by which a point on the plane moves while the camera moves through
+the window."""
 
 NEAREST_PLANE = 2.0
-"""Nearest plane, in multiples of how far the camera goes in the window from where it is in its middle."""
+"""Smallest depth of a plane, as a multiple of the largest distance of the camera from its place in mid-window."""
 
 STEPS_OF_WINDOW = 512
 """Instants of a window at which its poses are taken."""
@@ -59,14 +60,15 @@ STEPS_OF_WINDOW = 512
 
 @dataclass(frozen=True)
 class Reading:
-    """A way in which the poses of a file may be meant, other than that in which they were read."""
+    """A convention in which the poses of a file may be written."""
 
     words: str
-    """What the poses are, if this reading is right; follows "read as"."""
+    """Name of the convention. It can follow "read as"."""
     of: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
-    """Turns the trajectory as it was read into that which was meant."""
+    """Function from the trajectory as it was read to the trajectory in this convention."""
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Signs of the camera's axes; an odd number of negative ones mirrors the picture, or puts the scene behind."""
+    """Signs of the camera's axes. An odd number of negative signs mirrors the picture, or puts the scene behind the
+    camera."""
 
 
 def _inverse(trajectory: Trajectory) -> Trajectory:
@@ -84,7 +86,7 @@ def _axes(signs: tuple[float, float, float]) -> str:
     return f"axes with x {x}, y {y}, z {z}"
 
 
-AS_READ = Reading("what they were read as")
+AS_READ = Reading("the convention in which they were read")
 OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1))
 INVERSE = Reading("world to camera, the inverse", _inverse)
 SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)))
@@ -104,20 +106,20 @@ READINGS = (
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may be the case with poses and calibration."""
+    """A possible error of poses and calibration."""
 
     delay: int = 0
-    """How much later (ns) the poses are stamped than events of the same instant."""
+    """Nanoseconds by which the poses are stamped later than events of the same instant."""
     focal_scale: float = 1.0
     """The focal length as a multiple of the stated one."""
     reading: Reading = AS_READ
 
     @property
     def words(self) -> str:
-        """What it says about the poses' clock and the focal length; that they are as stated if it says nothing."""
-        said = [f"poses {self.delay * 1e-6:+.3g} ms"] * (self.delay != 0)
-        said += [f"focal length {100 * (self.focal_scale - 1):+.0f} %"] * (self.focal_scale != 1)
-        return ", ".join(said) or "as stated"
+        """The changes of the poses' clock and of the focal length, or "as stated" if there are none."""
+        changes = [f"poses {self.delay * 1e-6:+.3g} ms"] * (self.delay != 0)
+        changes += [f"focal length {100 * (self.focal_scale - 1):+.0f} %"] * (self.focal_scale != 1)
+        return ", ".join(changes) or "as stated"
 
 
 AS_STATED = Hypothesis()
@@ -125,60 +127,59 @@ AS_STATED = Hypothesis()
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Events that are warped to one instant."""
+    """A short part of a recording, whose events are compensated for the camera's motion together."""
 
     start: int
-    """First and last time, ns."""
+    """First time, ns."""
     end: int
+    """Last time, ns."""
     speed: float
-    """Pixels a second that the picture moves."""
+    """Speed of the picture, pixels per second."""
     events: Events
 
     @property
     def instant(self) -> int:
-        """The time, ns, that events are warped to."""
+        """The time, ns, to which events are moved: the middle of the window."""
         return (self.start + self.end) // 2
 
 
 class EventFocus:
-    """Events of a recording, warped to one instant of each of some windows.
+    """Motion compensation of the events in some windows of a recording.
 
-    Each event of a window is moved to where the camera saw its edge at the instant in the middle, by the poses and a
-    depth. The depth is that at which the events of a tile (16 grid pixels a side) are sharpest, found by a sweep of
-    planes as in `depth_range`, for each hypothesis anew, so that it has the depths that serve it best. Sharpness is the
-    variance of the image of warped events (Gallego et al., "A Unifying Contrast Maximization Framework", CVPR 2018),
-    summed over the pixels and divided by the number of events. Every hypothesis is measured with the same events; those
-    that leave the view, or go behind the camera, add nothing; and magnification does not count as sharpness.
+    Poses and a depth move each event of a window to the place where the camera saw its edge in mid-window. A plane
+    sweep (`scene.depth_range`) finds the depth of each tile (16 grid pixels a side): the one at which the tile's events
+    are sharpest. It is found anew for each hypothesis, so that each hypothesis has the depths that serve it best.
+    Sharpness is the variance of the image of moved events (Gallego et al., "A Unifying Contrast Maximization
+    Framework", CVPR 2018), summed over the pixels and divided by the number of events. All hypotheses are measured with
+    the same events. Events that leave the view, or go behind the camera, add nothing. Magnification does not count as
+    sharpness.
 
     Args:
         recording: Its index is made if it is not there yet.
-        distance: Usual depth of the scene, metres; by it windows are chosen that are long enough.
+        distance: Usual depth of the scene, metres. It decides how long the windows are.
     """
 
     def __init__(self, recording: EventRecording, distance: float):
         self.recording = recording
-        start, end = index_events(recording).span
-        start, end = max(start, recording.trajectory.start), min(end, recording.trajectory.end)
-        self.largest_delay = min(LARGEST_DELAY, (end - start) // 4)
+        self.largest_delay = largest_delay(recording)
         """Longest delay, ns, for which there are poses around each event of the windows."""
         self.windows = []
-        """In time order; none where there are too few events, or pixels, to say anything."""
-        if (
-            recording.camera.width * recording.camera.height * grid_scale(recording.camera) ** 2
-            >= FEWEST_TILES * TILE**2
-        ):
+        """Windows in time order. None if there are too few events or pixels."""
+        camera = recording.camera
+        if camera.width * camera.height * grid_scale(camera) ** 2 >= FEWEST_TILES * TILE**2:
+            start, end = _posed_span(recording)
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
         self._trajectories = {AS_READ: recording.trajectory}
-        self._cameras = {1.0: recording.camera}
+        self._cameras = {1.0: camera}
 
     @property
     def speed(self) -> float:
-        """Pixels a second that the picture moves in the fastest windows (90th percentile)."""
+        """Speed of the picture in fast windows (90th percentile), pixels per second."""
         return float(np.percentile([window.speed for window in self.windows], 90))
 
     @cached_property
     def turn(self) -> float:
-        """Radians by which the line of sight turns away from where it is in the middle of a window, the most of all."""
+        """Largest angle (radians, as its sine) between the line of sight and that in mid-window, over all windows."""
         turns = []
         for window in self.windows:
             times = np.append(evenly_spaced(window.start, window.end, 17), window.instant)
@@ -188,21 +189,17 @@ class EventFocus:
 
     def sharpness(self, hypothesis: Hypothesis = AS_STATED) -> Float64[np.ndarray, "windows*tiles"]:
         """Sharpness of each tile at its best depth, as a share of the sum over the tiles of a window."""
-        return np.concatenate(
-            [
-                self._sweep(window, _some(window.events, EVENTS_PER_WINDOW), hypothesis)[0].max(0)
-                for window in self.windows
-            ]
-        )
+        sweeps = (self._sweep(window, _some(window.events, EVENTS_PER_WINDOW), hypothesis) for window in self.windows)
+        return np.concatenate([sharpness.max(0) for sharpness, *_ in sweeps])
 
     def picture(
         self, window: Window, hypothesis: Hypothesis | None = AS_STATED
     ) -> tuple[Float64[np.ndarray, "rows columns"], float]:
-        """Events of a window, each tile at its best depth: how many a grid pixel holds, and the sharpness.
+        """Number of motion-compensated events at each grid pixel, each tile at its best depth; and the sharpness.
 
         Args:
             window: One of `windows`.
-            hypothesis: None: events are drawn where they fired.
+            hypothesis: Poses and calibration to compensate with; None counts events where they fired.
         """
         events = _some(window.events, EVENTS_PER_PICTURE)
         camera = self._camera(1.0 if hypothesis is None else hypothesis.focal_scale)
@@ -233,7 +230,7 @@ class EventFocus:
         Float64[np.ndarray, "rays 3"],
         Float64[np.ndarray, " planes"],
     ]:
-        """Sharpness of each tile at each plane; and rays, their centres as shares of the way, and planes."""
+        """Sharpness of each tile at each plane; rays, their centres relative to the camera's way, and planes."""
         read = self._trajectory(hypothesis.reading)
         times = evenly_spaced(window.start, window.end, STEPS_OF_WINDOW)
         moments = np.append(times, window.instant) + hypothesis.delay
@@ -258,7 +255,7 @@ class EventFocus:
         return self._trajectories[reading]
 
     def allows(self, focal_scale: float) -> bool:
-        """Whether the lens has an inverse with such a multiple of its focal length."""
+        """Whether the lens model can be inverted with this multiple of the stated focal length."""
         try:
             self._camera(focal_scale).pixel_directions()
         except ValueError:
@@ -273,14 +270,26 @@ class EventFocus:
         return self._cameras[scale]
 
 
+def largest_delay(recording: EventRecording) -> int:
+    """Longest delay of a clock that is searched, ns."""
+    start, end = _posed_span(recording)
+    return min(LONGEST_DELAY, (end - start) // 4)
+
+
+def _posed_span(recording: EventRecording) -> tuple[int, int]:
+    """First and last time (ns) at which there are both events and poses."""
+    start, end = index_events(recording).span
+    return max(start, recording.trajectory.start), min(end, recording.trajectory.end)
+
+
 def _some(events: Events, at_most: int) -> Events:
-    """About so many events, evenly taken."""
+    """About `at_most` of the events, evenly taken."""
     step = max(round(len(events) / at_most), 1)
     return Events(events.x[::step], events.y[::step], events.t[::step], events.p[::step])
 
 
 def _windows(recording: EventRecording, start: int, end: int, distance: float) -> list[Window]:
-    """Windows within a span of time (ns), in order, outside the gaps of the poses."""
+    """The windows within a span of time (ns), in order, outside gaps of the poses."""
     spans, speeds, changes = _spans_of_motion(recording, start, end, distance)
     if not len(spans):
         return []
@@ -300,8 +309,8 @@ def _windows(recording: EventRecording, start: int, end: int, distance: float) -
 def _spans_of_motion(
     recording: EventRecording, start: int, end: int, distance: float
 ) -> tuple[Int64[np.ndarray, "spans 2"], Float64[np.ndarray, " spans"], Float64[np.ndarray, " spans"]]:
-    """Spans of time (ns), one after the other, in which the picture moves by PATH_OF_WINDOW; its speed (pixels/s) in
-    each, and by how much the velocity differs from its mean."""
+    """Successive spans of time (ns) in which the picture moves by PATH_OF_WINDOW, the speed of the picture in each
+    (pixels per second), and the mean deviation of its velocity within each (pixels per second)."""
     none = np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0)
     if end - start < 2:
         return none
@@ -318,7 +327,7 @@ def _spans_of_motion(
         far = np.searchsorted(path, path[begin] + PATH_OF_WINDOW * recording.camera.width)
         late = np.searchsorted(times, times[begin] + LONGEST_WINDOW)
         after = min(far, late)
-        if after > number:  # the rest is a part of a window: that which ends with the recording
+        if after > number:  # too little is left for a window, so the last one ends with the recording
             after = number
             begin = int(max(np.searchsorted(path, path[-1] - PATH_OF_WINDOW * recording.camera.width, "right") - 1,
                             np.searchsorted(times, times[-1] - LONGEST_WINDOW), 0))  # fmt: skip

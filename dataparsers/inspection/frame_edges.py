@@ -1,4 +1,4 @@
-"""Edges of events on frames: whether both show the same at the same time."""
+"""Edges of events on edges of frames, which meet if both are on one clock."""
 
 from __future__ import annotations
 
@@ -16,48 +16,50 @@ from enerf_ns.dataparsers.recording.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 
 EVENTS_OF_EDGES = 0.05
-"""Events drawn onto a frame, as a share of the sensor's pixels: those nearest to its time."""
+"""Number of events that are drawn onto a frame, as a share of the sensor's pixels. They are the nearest ones in
+time."""
 
 MAX_FRAMES = 24
 """Most frames that are compared with events."""
 
 PICTURE_WIDTH = 320
-"""Most pixels across the pictures that are compared, and shown."""
+"""Largest width (pixels) of the pictures that are compared and shown."""
 
 DARKEST = 10.0
-"""Grey levels that are added before the logarithm, so that noise of dark pixels is no edge."""
+"""Grey levels that are added before the logarithm, so that the noise of dark pixels makes no edges."""
 
 NUM_PLANES = 12
-"""Depths tried where frames and events are seen from two places."""
+"""Number of depths that are tried if frames and events come from two cameras."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameEdges:
-    """Frames of a recording with the events around them, in the undistorted picture of the frames' camera.
+    """Frames of a recording and the events around them, in the undistorted picture of the frames' camera.
 
-    Where two cameras saw them, events are drawn at one depth, since theirs are not known here.
+    If frames and events come from two cameras, all events are drawn at one depth, since their own depths are unknown.
     """
 
     recording: EventRecording
     frames: Frames
-    """Some frames with events before and after."""
+    """Some of the frames that have events before and after."""
     events: Events
-    """In time order, of the time around the frames."""
+    """Events around these frames, in time order."""
     planes: Float64[np.ndarray, " planes"]
-    """Depths (metres) at which events may be drawn; one, infinity, where one camera saw both."""
+    """Depths (metres) at which events may be drawn. Only infinity if one camera took frames and events."""
 
     @classmethod
     def of(cls, recording: EventRecording, depth_range: tuple[float, float], largest_delay: int) -> FrameEdges | None:
-        """The frames that can be compared with events; None where there are none.
+        """Selects the frames that can be compared with events. None if there are none.
 
         Args:
             recording: Its sharp frames are taken, else the blurred ones.
             depth_range: Nearest and farthest depth, metres.
-            largest_delay: By which events are looked for before and after a frame, ns.
+            largest_delay: Largest delay between a frame and its events, ns.
         """
-        frames, index = recording.frames or recording.blurred_frames, index_events(recording)
-        if frames is None or (recording.reconstructed_by is not None and recording.frames is None):
+        frames = recording.camera_frames
+        if frames is None:
             return None
+        index = index_events(recording)
         first, last = index.span
         length = int(EVENTS_OF_EDGES * recording.camera.width * recording.camera.height / len(index) * (last - first))
         margin = largest_delay + length
@@ -77,10 +79,10 @@ class FrameEdges:
     def likeness(
         self, delays: Int64[np.ndarray, " delays"], plane: int, every: int = 1
     ) -> Float64[np.ndarray, "delays frames"]:
-        """Correlation of the gradient of frames with the density of events, if events are later by a delay (ns).
+        """Correlation between the gradient of each frame and the density of the events around it, for some delays.
 
         Args:
-            delays: Of events against frames.
+            delays: Delays of the events against the frames, ns.
             plane: Number of the depth at which events are drawn.
             every: 2 takes every second frame, and so on.
         """
@@ -93,13 +95,14 @@ class FrameEdges:
         return found
 
     def best_plane(self, delays: Int64[np.ndarray, " delays"]) -> int:
-        """Number of the depth that fits some of the frames best at any of some delays (ns)."""
+        """Number of the depth with the highest correlation, over every fourth frame and the best of some delays
+        (ns)."""
         if len(self.planes) == 1:
             return 0
         return int(np.argmax([self.likeness(delays, i, 4).mean(1).max() for i in range(len(self.planes))]))
 
     def picture(self, number: int) -> UInt8[np.ndarray, "rows columns channels"]:
-        """An undistorted frame, as wide as `PICTURE_WIDTH` at most."""
+        """An undistorted frame, at most `PICTURE_WIDTH` pixels wide."""
         return in_8_bits(self._picture(number))
 
     def _picture(self, number: int) -> Shaped[np.ndarray, "rows columns channels"]:
@@ -107,7 +110,7 @@ class FrameEdges:
         return cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA).reshape(*self._size[::-1], -1)
 
     def events_at(self, time: int, plane: int) -> UInt8[np.ndarray, "rows columns 4"]:
-        """Events around a time (ns) on a transparent picture that fits onto that of a frame, in colours of polarity."""
+        """Events around a time (ns) in the colours of their polarity, on a transparent picture to lay over a frame."""
         chosen = self._nearest(time)
         at, on = self._places(chosen, plane), self.events.p[chosen] > 0
         at, on = at[at >= 0], on[at >= 0]
@@ -124,7 +127,8 @@ class FrameEdges:
 
     @cached_property
     def _tables(self) -> list[Int64[np.ndarray, "height width"]]:
-        """For each plane, where each pixel of the events is in the pictures: row * columns + column, or -1."""
+        """For each plane, the place of each pixel of the event camera in the pictures: row * columns + column, or
+        -1."""
         (columns, rows), seen = self._size, self.frames.camera.undistorted()
         time = torch.as_tensor(self.frames.times[0])
         events, frames = (owner.trajectory.poses(time).numpy() for owner in (self.recording, self.frames))

@@ -1,4 +1,4 @@
-"""Corners that are followed from frame to frame: whether they go where poses and calibration let them."""
+"""Corners that are tracked from frame to frame, and their reprojection errors."""
 
 from __future__ import annotations
 
@@ -13,33 +13,36 @@ from enerf_ns.dataparsers.recording.picture_depth import brightness, in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 
 NUM_PAIRS = 24
-"""Most pairs of frames between which corners are followed."""
+"""Most pairs of frames between which corners are tracked."""
 
 FRAMES_APART = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""How many frames a pair may be apart; the first is taken over which corners move by `SHORTEST_WAY` and are found."""
+"""Distances in the sequence at which a pair of frames is tried. The first one is used at which corners have moved by
+`SHORTEST_WAY`."""
 
 SHORTEST_WAY = 0.04
-"""By how much corners must move (median), as a share of the width."""
+"""Smallest median motion of the corners of a pair, as a share of the width."""
 
 MOST_CORNERS, FEWEST_CORNERS = 300, 20
+"""Most corners of a frame, and fewest of a pair."""
 
 CORNER_QUALITY = 0.01
-"""Strength of a corner, as a share of the strongest one's."""
+"""Smallest strength of a corner, as a share of the strongest one's."""
 
 CORNER_DISTANCE = 1 / 60
-"""How far corners are apart, as a share of the width."""
+"""Smallest distance between corners, as a share of the width."""
 
-SEARCHED = {"winSize": (15, 15), "maxLevel": 4}
-"""Around each corner, on how many pyramid levels (Lucas and Kanade; OpenCV)."""
+OPTICAL_FLOW = {"winSize": (15, 15), "maxLevel": 4}
+"""Window (pixels) and pyramid levels of OpenCV's optical flow (Lucas and Kanade)."""
 
 FARTHEST_RETURN = 0.5
-"""Pixels by which a corner may be missed when it is followed back."""
+"""Pixels by which a corner that is tracked there and back may end beside its start."""
 
-LARGEST_MISS = 5.0
-"""Pixels above which all misses count alike."""
+LARGEST_ERROR = 5.0
+"""Reprojection error (pixels) above which all count alike."""
 
 NEAREST_DEPTH = 0.05
-"""Depth (relative to the nearest thing) at which what is behind the camera is put."""
+"""Smallest depth of a reprojected point, relative to the depth of the line's near or far end. Points behind the camera
+are put there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,24 +50,25 @@ class Pair:
     """Corners that were found in two frames."""
 
     first: int
+    """Number of the first frame."""
     second: int
-    """Numbers among the frames."""
+    """Number of the second frame."""
     directions: Float64[np.ndarray, "2 corners 2"]
-    """x / z and y / z of where each is seen in the first and in the second frame, by the calibration as stated."""
+    """Directions (x / z, y / z) in which the first and the second frame see each corner, by the stated calibration."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTracks:
-    """Corners followed from frame to frame by optical flow, there and back."""
+    """Corners that optical flow tracks from one frame to another and back."""
 
     frames: Frames
     pairs: list[Pair]
 
     @classmethod
     def of(cls, recording: EventRecording) -> FrameTracks | None:
-        """Corners of the sharp frames, else of the blurred ones; None where there are no two that share some."""
-        frames = recording.frames or recording.blurred_frames
-        if frames is None or (recording.reconstructed_by is not None and recording.frames is None):
+        """Tracks corners of the sharp frames, else of the blurred ones. None if no two frames share corners."""
+        frames = recording.camera_frames
+        if frames is None:
             return None
         known = np.flatnonzero(recording.knows_poses(frames))
         starts = np.unique(np.linspace(0, len(known) - 2, NUM_PAIRS).round().astype(int)) if len(known) > 1 else []
@@ -72,11 +76,14 @@ class FrameTracks:
         pairs = [pair for pair in found if pair is not None]
         return cls(frames, pairs) if pairs else None
 
-    def misses(self, nearest: float, focal_scale: float = 1.0, delay: int = 0) -> list[Float64[np.ndarray, " corners"]]:
-        """How far the corners of each pair are found from where they can be, pixels of a frame without distortion.
+    def reprojection_errors(
+        self, nearest: float, focal_scale: float = 1.0, delay: int = 0
+    ) -> list[Float64[np.ndarray, " corners"]]:
+        """Distances of the corners of each pair from their epipolar lines, pixels of a frame without distortion.
 
-        Where the corner of the first frame can be in the second one is a line: a part of its epipolar line, from the
-        nearest depth to infinity; a point where the camera only turned.
+        The depth of a corner of the first frame is unknown, so that it may lie anywhere on a part of its epipolar line
+        in the second frame: from the point of the nearest depth to the point of infinity. If the camera only turns, the
+        line is a point.
 
         Args:
             nearest: Least depth of the scene, metres.
@@ -95,27 +102,30 @@ class FrameTracks:
             begin, end = (
                 focal_scale * focal * point[:, :2] / np.maximum(point[:, 2:], NEAREST_DEPTH) for point in (far, near)
             )
-            way, miss = end - begin, focal * pair.directions[1] - begin
-            share = (miss * way).sum(1) / np.maximum((way**2).sum(1), 1e-12)
-            found.append(np.linalg.norm(miss - share.clip(0, 1)[:, None] * way, axis=1))
+            line, away = end - begin, focal * pair.directions[1] - begin
+            share = (away * line).sum(1) / np.maximum((line**2).sum(1), 1e-12)
+            found.append(np.linalg.norm(away - share.clip(0, 1)[:, None] * line, axis=1))
         return found
 
     def fit(self, nearest: float, focal_scale: float, delay: int) -> Float64[np.ndarray, " pairs"]:
-        """How much less than `LARGEST_MISS` corners are missed by on average, as a share of it; 1 at best."""
-        misses = self.misses(nearest, focal_scale, delay)
-        return np.array([1 - np.minimum(miss, LARGEST_MISS).mean() / LARGEST_MISS for miss in misses])
+        """1 less the mean reprojection error of each pair in units of `LARGEST_ERROR`: 1 at best, 0 at worst.
+
+        The arguments are those of `reprojection_errors`.
+        """
+        errors = self.reprojection_errors(nearest, focal_scale, delay)
+        return np.array([1 - np.minimum(error, LARGEST_ERROR).mean() / LARGEST_ERROR for error in errors])
 
 
 def _follow(frames: Frames, numbers: np.ndarray) -> Pair | None:
-    """Corners of the first of some frames, in the next one in which they are elsewhere; None if they are not found."""
+    """Tracks corners from the first of some frames to the next one in which they have moved. None if they are lost."""
     width, first = frames.camera.width, _grey(frames, numbers[0])
     corners = cv2.goodFeaturesToTrack(first, MOST_CORNERS, CORNER_QUALITY, max(CORNER_DISTANCE * width, 3.0))
     for apart in FRAMES_APART:
         if corners is None or apart >= len(numbers):
             return None
         second = _grey(frames, numbers[apart])
-        moved, is_found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, corners.copy(), **SEARCHED)
-        back, is_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, moved.copy(), **SEARCHED)
+        moved, is_found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, corners.copy(), **OPTICAL_FLOW)
+        back, is_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, moved.copy(), **OPTICAL_FLOW)
         returned = np.linalg.norm(back - corners, axis=2) < FARTHEST_RETURN
         kept = ((is_found > 0) & (is_back > 0) & returned)[:, 0]
         if kept.sum() < FEWEST_CORNERS:

@@ -1,4 +1,4 @@
-"""What a recording holds and what is wrong with it, as tables and as a page of pictures."""
+"""Tables and a page of figures about a recording, and its problems."""
 
 from __future__ import annotations
 
@@ -51,21 +51,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NUM_INSTANTS = 6
-"""Number of instants at which events are shown, beside the frames of the same times."""
+"""Number of instants at which events are shown, each beside the frame of the same time."""
 NUM_OVERLAYS = 4
 """Number of frames that edges of events are drawn on."""
-NUM_WARPED = 3
-"""Number of instants that events are warped to: of slow, of usual and of fast motion."""
-BRIGHTEST = 99.5
-"""Percentile of the counts of warped events that is drawn black."""
+NUM_COMPENSATED = 3
+"""Number of windows whose motion-compensated events are shown: with slow, usual and fast motion."""
+BLACK_PERCENTILE = 99.5
+"""Percentile of the counts of motion-compensated events that is drawn black."""
 NUM_FRUSTA = 16
 """Number of cameras drawn along the trajectory."""
 PICTURE_WIDTH = 640
-"""Most pixels across a picture on the page."""
+"""Largest width of a picture on the page, pixels."""
 NAMED_HOT_PIXELS = 8
-"""Number of hot pixels that are listed one by one; the heat map marks all."""
+"""Number of hot pixels that are listed one by one. The heat map marks all of them."""
 
-ALL_DELAYS = (0, *(delay * MILLISECOND for delay in SHOWN_DELAYS))
+OVERLAY_DELAYS = [0, *(delay * MILLISECOND for delay in SHOWN_DELAYS)]
 """Delays (ns) of the events that are laid over frames."""
 
 BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
@@ -73,51 +73,53 @@ BLUE, GREEN, RED, GREY = "#3b6fb6", "#3a9d6a", "#d9352a", "#5a6272"
 
 @dataclass(frozen=True)
 class Instant:
-    """What the page shows of one time; pictures as data URIs."""
+    """Pictures of one time, as data URIs."""
 
     time: str
-    """Time in seconds, with their unit."""
+    """Time with its unit."""
     events: str
     frame: str | None = None
-    """Frame of this time as a data URI; None where there are events alone."""
+    """Frame of this time. None without frames."""
     frame_name: str = ""
+    """Name of the frame's file."""
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """A frame and the events of different times to be laid over it; pictures as data URIs."""
+    """A frame, and events of different times to lay over it, as data URIs."""
 
     time: str
+    """Time of the frame, with its unit."""
     frame: str
     events: list[str]
-    """One for each of the delays that the page offers."""
+    """Events for each delay that the page offers."""
 
 
 @dataclass(frozen=True)
-class Warped:
-    """Events of a short time, warped to one instant by one hypothesis."""
+class Compensated:
+    """Motion-compensated events of a window under one hypothesis."""
 
     words: str
-    """The hypothesis, and how sharp it makes them."""
+    """The hypothesis, and the sharpness of the events."""
     picture: str
-    """As a data URI."""
+    """Picture of the events as a data URI."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """A recording with all that was found out about it."""
+    """A recording with its statistics, measurements and problems."""
 
     recording: EventRecording
     statistics: EventStatistics
     depth_range: tuple[float, float] | None
-    """Nearest and farthest depth of the scene, metres; None where it is neither stated nor can be measured."""
+    """Nearest and farthest depth of the scene, metres. None if it is neither stated nor measurable."""
     problems: list[Problem]
     sensor: SensorSurvey
-    """What events and frames say about the sensor."""
+    """Sensor parameters, stated and measured."""
     agreement: Agreement | None = None
-    """What the events say about clocks, poses and focal length; None where they are too few to say anything."""
+    """Agreement of clocks, poses and focal length with the events. None if there are too few events."""
     as_stated: Agreement | None = None
-    """The same of what was stated, where the recording is one that was refined."""
+    """The same with the clocks, poses and focal length as stated. None unless a training refined them."""
 
     @classmethod
     def of(cls, recording: EventRecording) -> Inspection:
@@ -140,8 +142,10 @@ class Inspection:
         return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated)
 
     def print_tables(self, console: Console) -> None:
-        """What was found, numbers, and problems in red, on the terminal."""
+        """Prints all tables, notes in yellow and problems in red."""
         for title, rows in self._tables():
+            if not rows:
+                continue
             table = Table(title=title, show_header=False, title_justify="left")
             for name, value in rows.items():
                 table.add_row(name, Text(printable(value)))
@@ -151,11 +155,11 @@ class Inspection:
         console.print(problems_table(self.problems))
 
     def notes(self) -> list[str]:
-        """What was dropped, mended or assumed, one sentence each."""
+        """Sentences on what was left out of the recording, mended or assumed."""
         return [*self.recording.notes, *index_events(self.recording).notes]
 
     def found(self) -> dict[str, str]:
-        """What the reader found, by name."""
+        """The parts of the recording in words, by name."""
         recording, (first, *_, last) = self.recording, self.statistics.edges
         times = recording.trajectory.times
         interval = float(np.median(np.diff(times))) * 1e-9
@@ -180,7 +184,7 @@ class Inspection:
         return rows
 
     def numbers(self) -> dict[str, str]:
-        """What was counted and measured, by name."""
+        """Counts and measurements in words, by name."""
         recording, statistics = self.recording, self.statistics
         gaps = pose_gaps(recording, statistics)
         missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
@@ -190,14 +194,14 @@ class Inspection:
         places = ", ".join(f"({pixel % width}, {pixel // width})" for pixel in hot[:NAMED_HOT_PIXELS])
         more = f" and {len(hot) - NAMED_HOT_PIXELS} more" if len(hot) > NAMED_HOT_PIXELS else ""
         rows = {
-            "event rate": f"{_round(statistics.num_events / statistics.seconds)} a second, "
+            "event rate": f"{_round(statistics.num_events / statistics.seconds)} per second on average, "
             f"{_round(statistics.rate.max())} at most",
-            "a pixel": f"{statistics.events_per_pixel:.3g} events; "
+            "per pixel": f"{statistics.events_per_pixel:.3g} events; "
             f"{100 * statistics.share_below_two:.1f} % of the pixels have fewer than two",
             "polarity": f"{100 * statistics.num_on / statistics.num_events:.1f} % on, "
             f"{100 * statistics.num_off / statistics.num_events:.1f} % off",
             "hot pixels": f"{len(hot):,} left out, (x, y) = {places}{more}" if len(hot) else "none left out",
-            "pose coverage": f"{100 * (1 - missing):.3g} % of the events' time"
+            "pose coverage": f"{100 * (1 - missing):.3g} % of the time with events"
             + (f", {len(gaps)} gap{'s' * (len(gaps) > 1)}" if len(gaps) else ", no gaps"),
             "path": f"{np.nansum(np.linalg.norm(np.diff(path, axis=0), axis=1)):.3g} m long, "
             f"spans {np.linalg.norm(np.nanmax(path, axis=0) - np.nanmin(path, axis=0)):.3g} m",
@@ -208,49 +212,45 @@ class Inspection:
             _, scale, box = scene_normalisation(recording, near, far)
             sides = " x ".join(f"{side:.3g}" for side in (box[1] - box[0]) / scale)
             rows["near and far"] = f"{near:.3g} m and {far:.3g} m, {source}"
-            rows["beyond"] = f"{percent(share_beyond(recording, self.depth_range))} of the events"
-            rows["box"] = f"{sides} m, all that the camera sees; 1 m is {scale:.3g} in Nerfstudio"
+            beyond = percent(share_beyond(recording, self.depth_range))
+            rows["beyond"] = f"{beyond} of the events come from beyond the farthest depth"
+            rows["box"] = f"{sides} m, around all that the camera sees; 1 m is {scale:.3g} units in Nerfstudio"
         else:
             rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
         return rows
 
     def focus(self) -> dict[str, str]:
-        """What events say about clocks, poses and focal length, by name; empty where they are too few."""
+        """Agreement of clocks, poses and focal length with the events, by name. Empty if there are too few events."""
         rows = self.agreement.rows() if self.agreement else {}
         stated = self.as_stated.rows() if self.as_stated else {}
         return rows | {f"{name}, as stated": value for name, value in stated.items() if value != rows.get(name)}
 
     def _tables(self) -> list[tuple[str, dict[str, str]]]:
-        tables = [
+        return [
             ("Recording", self.found()),
             ("Numbers", self.numbers()),
-            ("Sensor", self.sensor.rows()),
-            ("Focus", self.focus()),
+            ("Sensor: stated, and measured from events and frames", self.sensor.rows()),
+            ("Do clocks, poses and calibration agree with the events?", self.focus()),
         ]
-        return [(title, rows) for title, rows in tables if rows]
 
     def page(self, corrections: Figure | None = None) -> str:
-        """One HTML file with all pictures in it, which loads nothing.
+        """One HTML file that holds all figures and loads nothing.
 
         Args:
-            corrections: What was refined of the trajectory, over time.
+            corrections: Figure of the corrections of the trajectory over time.
         """
         return fill_page(
             Path(__file__).with_name("inspection.html"),
             name=self.recording.path.name,
             path=self.recording.path,
             problems=self.problems,
-            tables=[
-                ("What was found", self.found(), self.notes()),
-                ("In numbers", self.numbers(), []),
-            ],
-            sensor=self.sensor.rows(),
+            tables=self._tables(),
+            notes=self.notes(),
             bursts=_plot(self.bursts(self.sensor.bursts)) if self.sensor.bursts else None,
-            focus=self.focus(),
             delays=self._delays(),
             flick=self._flick(),
             overlays=self._overlays(),
-            warped=self._warped(),
+            compensated=self._compensated(),
             has_frames=self._frames is not None,
             corrections=_plot(corrections) if corrections else None,
             timeline=_plot(self.timeline()),
@@ -260,7 +260,7 @@ class Inspection:
         )
 
     def timeline(self) -> Figure:
-        """When there are events, frames and poses; below, the event rate, with silences and bursts in red."""
+        """Figure of the times of events, frames and poses, and of the event rate, with silences and bursts in red."""
         from matplotlib.figure import Figure
 
         recording, statistics = self.recording, self.statistics
@@ -296,7 +296,7 @@ class Inspection:
         return figure
 
     def bursts(self, bursts: FrameBursts) -> Figure:
-        """The event rate around the stamps of frames, with bursts in red."""
+        """Figure of the event rate around the stamps of frames, with bursts in red."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(11.4, 2.6), layout="constrained", dpi=150)
@@ -309,13 +309,14 @@ class Inspection:
         axis.set_xlim(edges[0], edges[-1])
         axis.set_ylim(0, None)
         axis.set_xlabel("milliseconds from the stamp of a frame")
-        axis.set_ylabel("times the usual rate")
+        axis.set_ylabel("event rate / median")
         axis.spines[["top", "right"]].set_visible(False)
         return figure
 
     def trajectory(self) -> Figure:
-        """The path, the view of some cameras and the box, along the mean up direction of the cameras."""
+        """Figure of the path, some view frusta and the box, seen along the mean up direction of the cameras."""
         from matplotlib.figure import Figure
+        from matplotlib.patches import Rectangle
 
         transform, scale, box = scene_normalisation(self.recording, *(self.depth_range or (1.0, 2.0)))
         from_above = transform[:2, :3]
@@ -326,7 +327,7 @@ class Inspection:
         figure = Figure(figsize=(5.6, 5.0), layout="constrained", dpi=150)
         axis = figure.subplots()
         if self.depth_range:
-            axis.add_patch(_rectangle(low, high))
+            axis.add_patch(Rectangle(tuple(low), *(high - low), fill=False, linestyle="--", edgecolor=GREY))
             size = max(size, (high - low).max())
 
         camera = self.recording.camera.undistorted()
@@ -344,13 +345,13 @@ class Inspection:
                 axis.plot(*np.stack([places[i], end]).T, color=colour, linewidth=0.9)
         axis.set_aspect("equal", adjustable="datalim")
         axis.margins(0.06)
-        axis.set_xlabel("metres" + "; dashed: the box" * bool(self.depth_range))
+        axis.set_xlabel("metres" + "; dashed: the box around the scene" * bool(self.depth_range))
         axis.spines[["top", "right"]].set_visible(False)
         figure.colorbar(path, ax=axis, label="seconds", shrink=0.8)
         return figure
 
     def heat_map(self) -> Figure:
-        """Events of each pixel on a logarithmic scale; hot pixels are circled."""
+        """Figure of the number of events of each pixel on a logarithmic scale, with hot pixels circled."""
         from matplotlib import colormaps
         from matplotlib.colors import LogNorm
         from matplotlib.figure import Figure
@@ -368,7 +369,8 @@ class Inspection:
         return figure
 
     def _path(self, number: int) -> tuple[Int64[np.ndarray, " number"], Float64[np.ndarray, "number 3 4"]]:
-        """Times and poses while there are events; not a number within gaps between poses."""
+        """Evenly spaced times (ns) from the first event to the last, and the poses, which are NaN in gaps of the
+        poses."""
         first, last = self.statistics.edges[[0, -1]]
         times = evenly_spaced(first, last, number)
         poses = self.recording.trajectory.poses(torch.from_numpy(times)).numpy()
@@ -398,20 +400,20 @@ class Inspection:
         ]
 
     def _delays(self) -> list[str]:
-        """Delays of the events that are laid over frames, in words: those of `_delays_ns`."""
+        """The delays of `_delays_ns` in words."""
         return [
-            "as stamped" if not delay else f"{delay / MILLISECOND:+.3g} ms" + " (best)" * (delay not in ALL_DELAYS)
+            "as stamped" if not delay else f"{delay / MILLISECOND:+.3g} ms" + " (best)" * (delay not in OVERLAY_DELAYS)
             for delay in self._delays_ns()
         ]
 
     def _delays_ns(self) -> list[int]:
-        """As stamped, wrong ones, and the best, if that is another."""
+        """Delays (ns) of the events that are laid over frames: `OVERLAY_DELAYS`, and the best one if it is another."""
         best = self.agreement.frame_delay if self.agreement else None
-        found = round(-best.value) * MILLISECOND if best and best.is_told else 0
-        return [0, *(delay for delay in ALL_DELAYS if delay), *([found] if found not in ALL_DELAYS else [])]
+        found = round(-best.value) * MILLISECOND if best and best.is_identifiable else 0
+        return OVERLAY_DELAYS + [found] * (found not in OVERLAY_DELAYS)
 
     def _flick(self) -> int:
-        """Number of the delay that the page flicks to: the best if what is stated is wrong, else the last wrong one."""
+        """Number of the delay that the page flicks to: the best one if the stated one is wrong, else a wrong one."""
         delays = self._delays_ns()
         is_wrong = self.agreement and self.agreement.pixels(delays[-1] / MILLISECOND) > HARMFUL_SHIFT
         return len(delays) - 1 if is_wrong else len(SHOWN_DELAYS)
@@ -433,29 +435,30 @@ class Inspection:
             for i in chosen.tolist()
         ]
 
-    def _warped(self) -> list[tuple[str, list[Warped]]]:
-        """For some instants, their time and speed in words, and pictures of events warped to them."""
+    def _compensated(self) -> list[tuple[str, list[Compensated]]]:
+        """For some windows, time and speed in words, and pictures of motion-compensated events."""
         if self.agreement is None:
             return []
         focus, readings = self.agreement.focus, self.agreement.readings
-        delay = round(self.agreement.pose_delay.value) * MILLISECOND if self.agreement.pose_delay.is_told else 0
+        pose_delay = self.agreement.pose_delay
+        delay = round(pose_delay.value) * MILLISECOND if pose_delay.is_identifiable else 0
         best = Hypothesis(delay, 1.0, AS_READ if AS_READ in readings else readings[0])
         hypotheses = [AS_STATED, *(shown for shown in shown_hypotheses() if focus.allows(shown.focal_scale))]
         hypotheses += [best] if best not in hypotheses else []
         by_speed = sorted(focus.windows, key=lambda window: window.speed)
         shown = []
-        for i in np.unique(np.linspace(0, len(by_speed) - 1, NUM_WARPED).round().astype(int)):
+        for i in np.unique(np.linspace(0, len(by_speed) - 1, NUM_COMPENSATED).round().astype(int)):
             window = by_speed[i]
             pictures = [focus.picture(window, hypothesis) for hypothesis in hypotheses]
-            black = float(np.percentile(pictures[0][0], BRIGHTEST)) or 1.0
-            unwarped, _ = focus.picture(window, None)
-            row = [Warped("where they fired", _density(unwarped, black))]
+            black = float(np.percentile(pictures[0][0], BLACK_PERCENTILE)) or 1.0
+            as_fired, _ = focus.picture(window, None)
+            row = [Compensated("without compensation", _density(as_fired, black))]
             for hypothesis, (picture, sharpness) in zip(hypotheses, pictures, strict=True):
                 words = hypothesis.words + (" (best)" if hypothesis is best else "")
-                row.append(Warped(f"{words}: {100 * sharpness / pictures[0][1]:.0f} %", _density(picture, black)))
+                row.append(Compensated(f"{words}: {100 * sharpness / pictures[0][1]:.0f} %", _density(picture, black)))
             title = (
-                f"{_seconds(window.instant)}, {1e-6 * (window.end - window.start):.0f} ms of events, the picture moves "
-                f"at {window.speed:.0f} pixels/s"
+                f"{_seconds(window.instant)}: {1e-6 * (window.end - window.start):.0f} ms of events; the picture moves "
+                f"at {window.speed:.0f} pixels per second"
             )
             shown.append((title, row))
         return shown
@@ -465,11 +468,11 @@ class Inspection:
 
 
 def problems_table(problems: list[Problem]) -> Table | str:
-    """Problems in red, each with what to do about it, for the terminal."""
+    """Problems in red, each with advice, for the terminal."""
     if not problems:
         return "[green]No problems were found.[/green]"
     table = Table(title=f"[red]Problems ({len(problems)})[/red]", title_justify="left", show_lines=True)
-    table.add_column("what was found", style="red", ratio=1)
+    table.add_column("problem", style="red", ratio=1)
     table.add_column("what to do", ratio=1)
     for problem in problems:
         table.add_row(Text(printable(problem.what)), Text(printable(problem.advice)))
@@ -495,12 +498,12 @@ def _camera(camera: Camera) -> str:
         math.degrees(2 * math.atan(pixels / (2 * focal_length)))
         for pixels, focal_length in ((seen.width, seen.fx), (seen.height, seen.fy))
     )
-    return f"{camera.width} x {camera.height}, {camera.model}, sees {across:.0f} x {down:.0f} degrees"
+    return f"{camera.width} x {camera.height} pixels, {camera.model}, field of view {across:.0f} x {down:.0f} degrees"
 
 
 def _extrinsics(recording: EventRecording, frames: Frames) -> str:
     if frames.trajectory is recording.trajectory:
-        return "frames and events are seen from one place"
+        return "none: frames and events come from one camera"
     middle = torch.tensor(int(frames.times[len(frames.times) // 2]))
     if not recording.trajectory.covers(middle):
         return "unknown"
@@ -509,15 +512,9 @@ def _extrinsics(recording: EventRecording, frames: Frames) -> str:
     offset = events[:, :3].T @ (pictures[:, 3] - events[:, 3])
     x, y, z = 1e3 * offset
     return (
-        f"frame camera {x:.1f} mm right, {y:.1f} mm below, {z:.1f} mm before the event camera, "
+        f"frame camera {x:.1f} mm right of, {y:.1f} mm below and {z:.1f} mm in front of the event camera, "
         f"turned by {math.degrees(turn):.2g} degrees"
     )
-
-
-def _rectangle(low: np.ndarray, high: np.ndarray):
-    from matplotlib.patches import Rectangle
-
-    return Rectangle(tuple(low), *(high - low), fill=False, linestyle="--", edgecolor=GREY)
 
 
 def _plot(figure: Figure) -> str:
@@ -536,7 +533,7 @@ def _picture(pixels: UInt8[np.ndarray, "height width channels"], format: Literal
 
 
 def _density(counts: Float64[np.ndarray, "rows columns"], black: float) -> str:
-    """Counts as a picture, dark where there are many."""
+    """Counts as a picture in which large counts are dark."""
     return _picture((255 * (1 - np.sqrt(np.minimum(counts / black, 1))))[..., None].astype(np.uint8), "PNG")
 
 

@@ -1,4 +1,4 @@
-"""What a recording holds in numbers, and what is wrong with it; knows nothing of learning."""
+"""Statistics of a recording's events, and problems of the recording."""
 
 from __future__ import annotations
 
@@ -21,85 +21,82 @@ from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
 from enerf_ns.dataparsers.scene.depth_range import recording_parallax
 
 MAX_BINS = 1000
-"""Most bins of the event rate: more are not told apart on a screen."""
+"""Most bins of the event rate. A screen does not resolve more."""
 
 EVENTS_PER_BIN = 200
-"""Fewest events in a bin of the event rate on average; so many random events never leave a bin empty."""
+"""Fewest events in a bin of the event rate on average, so that random events never leave a bin empty."""
 
 SAMPLED_EVENTS = 2**22
-"""Events looked at to find problems, evenly taken, so that a training of a large recording does not wait."""
+"""Most events that are looked at to find problems, evenly taken, so that a training does not wait."""
 
 EVENTS_AT_ONCE = 2**24
 """Events whose times are held in memory while they are counted."""
 
 MAX_SHARE_OUTSIDE = 0.05
-"""Largest share of events or frames without poses; a camera that starts a moment before the tracker loses less."""
+"""Largest share of events or frames without poses. A camera that starts a moment before the tracker loses less."""
 
 MAX_TURN = 5.0
-"""Most degrees that the camera may turn between two poses. A hand's angular acceleration of 1000 degrees/s² at 20 poses
-a second turns the camera by 2.5 degrees between poses, of which interpolation gets 0.3 wrong: a few pixels."""
+"""Largest turn of the camera between two poses, degrees. A hand's angular acceleration of 1000 degrees/s² turns the
+camera by 2.5 degrees between poses at 20 poses per second. Interpolation is then wrong by 0.3 degrees, a few pixels."""
 
 JUMP_RATIO = 5
-"""Factor by which a jump between two poses is faster than its neighbourhood's median; the noise of a tracker stays
-below 3."""
+"""Factor by which a jump between two poses exceeds the median speed around it. The noise of a tracker stays below 3."""
 
 JUMP_NEIGHBOURHOOD = 11
-"""Steps between poses whose median speed a jump is compared to: more than twice the two steps of one wrong pose."""
+"""Steps between poses in that median: more than twice the two steps of one wrong pose."""
 
 MIN_JUMP = 5.0
-"""Least pixels by which the picture moves too far in a jump between two poses; smaller jumps are blurred, but do not
-double edges."""
+"""Smallest excess motion of the picture in a jump, pixels. Smaller jumps blur edges, but do not double them."""
 
 MOVING = 0.3
-"""Share of the picture's speed at a fast moment (90th percentile) above which the camera is said to move."""
+"""Share of the picture's speed at a fast moment (90th percentile) above which the camera moves."""
 
 DROPOUT_RATIO = 0.02
-"""Share of the usual event rate below which the sensor is silent; noise alone makes some per cent in dim light."""
+"""Share of the usual event rate below which the sensor is silent. In dim light, noise alone reaches some per cent."""
 
 MIN_SILENT_MOTION = 5.0
-"""Least pixels that the picture moves during a silence. Where the camera turns back, edges pass twice before pixels
-fire."""
+"""Smallest motion of the picture during a silence, pixels. If the camera turns back, edges pass a pixel twice before it
+fires."""
 
 BURST_RATIO = 20
-"""Factor by which a burst exceeds the usual event rate, beyond what the speed of the camera explains."""
+"""Factor by which a burst exceeds the usual event rate, beyond the speed of the camera."""
 
 MAX_POLARITY_RATIO = 3.0
-"""Largest ratio between on and off events. Sensors are set up for equal thresholds; those delivered stay below 2."""
+"""Largest ratio between on and off events. Sensors are set up for equal thresholds, and stay below 2 as delivered."""
 
 MAX_SHARE_BELOW_TWO = 0.5
-"""Largest share of pixels with fewer than two events, which make no pair to learn from."""
+"""Largest share of pixels with fewer than two events, which give no pair to learn from."""
 
 MIN_EVENTS_PER_PIXEL = 10
-"""Fewest events of a pixel on average: a few grey levels' worth of change; recordings that the method was shown on have
-dozens."""
+"""Fewest events per pixel on average, about a few grey levels. Recordings of publications have dozens."""
 
 MIN_SHARE_AT_CUT = 0.2
-"""Events in the last two columns (or rows) up to 255, as a share of the median column, from which it is a cut and not
-the border of the scene that they end at."""
+"""Events in the last two columns (or rows) up to 255, as a share of the median column, above which the coordinate is
+cut to 8 bits. Fewer events may end at the border of the scene."""
 
 FLOAT_TIMES, FEWEST_FLOAT_TIMES = 2**16, 100
-"""Times of events that are compared with numbers of single precision, and how many of them must be different ones."""
+"""Number of event times that are tested for single precision, and fewest different ones among them."""
 
 MAX_SHARE_HOT = 0.001
-"""Largest share of pixels that are hot; a healthy sensor has a handful."""
+"""Largest share of hot pixels. A healthy sensor has a handful."""
 
 MIN_FRAMES = 8
-"""Fewest frames, of which, with every fourth held out, six are left to learn from and two to score."""
+"""Fewest frames. With every fourth held out, six remain for learning and two for scores."""
 
 MAX_SHARE_DROPPED_FRAMES = 0.05
-"""Largest share of frames missing in a regular sequence; more of them point at wrong stamps."""
+"""Largest share of missing frames in a regular sequence. More suggest wrong time stamps."""
 
 MIN_PARALLAX = 5.0
-"""Least pixels of the events' camera by which the nearest point moves against the farthest: less is lost in blur."""
+"""Smallest motion of the nearest point against the farthest, pixels of the event camera. Less is lost in blur."""
 
 ASSUMED_NEAREST = 0.5
-"""Nearest depth that is assumed, metres, where the recording does not state how near the scene is."""
+"""Nearest depth (metres) of a scene whose depth range is unknown."""
 
 MAX_EXTENT = 100.0
-"""Most metres that the path of a camera spans; a hand-held path in millimetres spans hundreds."""
+"""Largest extent of the camera's path, metres. A hand-held path that is read in millimetres spans hundreds."""
 
 MAX_DEPTH_RATIO = 100.0
-"""Largest ratio between farthest and nearest depth; samples along rays are spread over all of it."""
+"""Largest ratio between farthest and nearest depth. Samples along rays are spread over the whole range."""
 
 
 @dataclass(frozen=True)
@@ -107,17 +104,17 @@ class Problem:
     """Something about a recording that makes learning from it worse, or impossible."""
 
     what: str
-    """What was found, with numbers; one sentence."""
+    """The finding with its numbers, in one sentence."""
     advice: str
-    """What to do about it; one sentence."""
+    """Advice on what to do, in one or two sentences."""
 
 
 @dataclass(frozen=True)
 class EventStatistics:
-    """The events of a recording in numbers; hot pixels that are left out are not counted."""
+    """Counts of a recording's events, without the hot pixels that are left out."""
 
     edges: Int64[np.ndarray, " bins+1"]
-    """Edges of the bins of time, ns; from the first event to the last."""
+    """Edges of the bins of time, ns, from the first event to the last."""
     rate: Float64[np.ndarray, " bins"]
     """Events per second in each bin of time."""
     counts: Int64[np.ndarray, "height width"]
@@ -132,7 +129,7 @@ class EventStatistics:
 
     @property
     def seconds(self) -> float:
-        """Seconds from the first event to the last, at least a nanosecond."""
+        """Time from the first event to the last, seconds, at least a nanosecond."""
         return max(int(self.edges[-1] - self.edges[0]), 1) * 1e-9
 
     @property
@@ -150,7 +147,7 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
 
     Args:
         recording: Its index is made if it is not there yet.
-        at_most: Events whose times are looked at for the rate, evenly taken; None: all. The other numbers are exact.
+        at_most: Most events that the rate is measured with, evenly taken. Default: all. The other numbers are exact.
 
     Raises:
         RecordingError: The events cannot be used.
@@ -175,11 +172,11 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
 
 
 def find_problems(recording: EventRecording, depth_range: tuple[float, float] | None = None) -> list[Problem]:
-    """What is wrong with a recording, and what to do about it; in seconds, once the events are indexed.
+    """Problems of a recording, with advice. Takes seconds once the events are indexed.
 
     Args:
         recording: Its index is made if it is not there yet.
-        depth_range: Nearest and farthest depth in metres, if known better than from the recording.
+        depth_range: Nearest and farthest depth, metres. Default: the range that the recording states, if any.
 
     Raises:
         RecordingError: The events cannot be used.
@@ -203,7 +200,7 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
 
 
 def pose_gaps(recording: EventRecording, statistics: EventStatistics) -> Int64[np.ndarray, "gaps 2"]:
-    """Begin and end (ns) of each gap of the poses that reaches into the span of the events."""
+    """Begin and end (ns) of each gap of the poses that overlaps the span of the events."""
     (first, *_, last), gaps = statistics.edges, recording.pose_gaps
     return gaps[(gaps[:, 0] < last) & (gaps[:, 1] > first)]
 
@@ -214,9 +211,9 @@ def pose_jumps(
     """Times (ns) of the poses before and after each jump, the largest jump first.
 
     Args:
-        recording: Of which the camera's steps from pose to pose are taken.
+        recording: Its poses are searched.
         statistics: Of its events.
-        depth_range: Nearest and farthest depth in metres, where it is known.
+        depth_range: Nearest and farthest depth, metres, if known.
     """
     times, turns, moves = _pose_steps(recording, statistics)
     intervals = np.diff(times)
@@ -230,12 +227,12 @@ def pose_jumps(
 def unusual_rates(
     recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
 ) -> tuple[Int64[np.ndarray, "silences 2"], Int64[np.ndarray, "bursts 2"]]:
-    """Begin and end (ns) of each time that the sensor is silent while it moves, and of each burst of events.
+    """Begin and end (ns) of each silence of the sensor while the camera moves, and of each burst of events.
 
     Args:
-        recording: Of which the camera's speed is taken.
+        recording: Its poses give the speed of the camera.
         statistics: Of its events.
-        depth_range: Nearest and farthest depth in metres, where it is known.
+        depth_range: Nearest and farthest depth, metres, if known.
     """
     edges, rate = statistics.edges, statistics.rate
     poses = recording.trajectory.poses(torch.from_numpy(edges)).numpy()
@@ -257,12 +254,12 @@ def _unfinished(folder: Path) -> Iterator[Problem]:
     try:
         stopped = settings.is_file() and read_json(settings).get("finished") is False
     except RecordingError as error:
-        yield Problem(str(error), "Without it nobody knows whether the simulation was stopped before its end.")
+        yield Problem(str(error), "Simulate the recording again; without this file, it may be only a part of it.")
         return
     if stopped:
         yield Problem(
             "The simulation of this recording was stopped before its end.",
-            "Simulate it again into a new folder, or use what there is.",
+            "Simulate it again into a new folder, or use the part that was simulated.",
         )
 
 
@@ -271,8 +268,8 @@ def _left_out(shares_outside_poses: dict[str, float]) -> Iterator[Problem]:
         if share > MAX_SHARE_OUTSIDE:
             yield Problem(
                 f"{percent(share)} of the {what} lie outside the poses and are left out.",
-                "Check that poses and events are on one clock, and add the poses that are missing; where the tracker "
-                "only saw a part, nothing else need be done.",
+                "Check that poses and events are on one clock, and add the poses that are missing. If the tracker saw "
+                "only a part of the recording, there is nothing else to do.",
             )
 
 
@@ -286,14 +283,14 @@ def _pose_problems(
         yield Problem(
             f"There are no poses for {(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on"
             + (f", and in {_count(len(gaps) - 1, 'other gap')}" if len(gaps) > 1 else "")
-            + f", while they usually come every {usual_interval}; what lies there is "
-            + ("used with guessed poses." if recording.keep_pose_gaps else "left out."),
+            + f", while they usually come every {usual_interval}; events and frames there are "
+            + ("used with interpolated poses." if recording.keep_pose_gaps else "left out."),
             f"Add the poses that are missing, or use a part that the tracker saw: {flag}.",
         )
     inside = ~np.isin(times[:-1], gaps[:, 0])
     if inside.any() and (turn := math.degrees(np.percentile(turns[inside], 99))) > MAX_TURN:
         yield Problem(
-            f"The camera turns by up to {turn:.0f} degrees from one pose to the next; those between are guesses.",
+            f"The camera turns by up to {turn:.0f} degrees from one pose to the next, too far to interpolate.",
             f"Record poses more often than every {usual_interval}, or use a slower part with --time-range.",
         )
     if len(jumps):
@@ -301,7 +298,8 @@ def _pose_problems(
         yield Problem(
             f"The poses hold {_count(len(jumps), 'jump')}; the largest is by {moves[largest]:.3g} m and "
             f"{math.degrees(turns[largest]):.2g} degrees at {jumps[0, 0] * 1e-9:.2f} s.",
-            f"Remove the wrong poses from their file, and they are interpolated; or use a part without: {flag}.",
+            "Remove the wrong poses from their file, so that they are interpolated, or use a part without jumps: "
+            f"{flag}.",
         )
 
 
@@ -316,25 +314,26 @@ def _distance_problems(
         found = f"its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by {shift:.1f} pixels"
     elif (parallax := recording_parallax(recording)).is_ruled_out:
         found = (
-            f"its rotation alone explains {parallax.num_at_infinity:,} parts of the views; depths explain "
-            f"{len(parallax.depths):,}, and depths behind the camera, which is chance, {parallax.num_by_chance:,}"
+            f"its rotation alone explains {parallax.num_at_infinity:,} parts of the views, depths explain "
+            f"{len(parallax.depths):,}, and depths behind the camera, which are chance, explain "
+            f"{parallax.num_by_chance:,}"
         )
     if found:
         yield Problem(
             f"The camera only turns: {found}.",
-            "Nothing tells near from far; move the camera sideways, and check that its positions are in metres.",
+            "Without parallax, depth is unknown: move the camera sideways, and check that its positions are in metres.",
         )
     if extent > MAX_EXTENT:
         yield Problem(
             f"The path of the camera spans {extent:,.0f} m.",
-            "Check that the positions are in metres and not in millimetres; of a path that really is so long, use a "
-            "part with --time-range.",
+            "Check that the positions are in metres and not in millimetres. If the path really is so long, use a part "
+            "with --time-range.",
         )
     if depth_range and depth_range[1] > MAX_DEPTH_RATIO * depth_range[0]:
         yield Problem(
             f"The scene reaches from {depth_range[0]:.3g} m to {depth_range[1]:.3g} m.",
-            "Samples along rays are spread thin over such a range; state a narrower one with --depth-range NEAR FAR of "
-            "the data parser (metres).",
+            "Samples along rays are sparse over such a range: state a narrower one with --depth-range NEAR FAR of the "
+            "data parser (metres).",
         )
 
 
@@ -344,14 +343,15 @@ def _rate_problems(silences: np.ndarray, bursts: np.ndarray, flag: str) -> Itera
         yield Problem(
             f"The sensor is silent {_times(len(silences))} while the camera moves; the longest silence lasts "
             f"{(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on.",
-            f"Lost events look like a scene without edges: use a part without ({flag}), or record fewer events with "
-            "higher thresholds or slower motion.",
+            f"Lost events look like a scene without edges: use a part without silences ({flag}), or record fewer "
+            "events with higher thresholds or slower motion.",
         )
     if len(bursts):
         yield Problem(
             f"The event rate bursts {_times(len(bursts))}, first at {bursts[0, 0] * 1e-9:.2f} s, to over "
-            f"{BURST_RATIO} times the usual one, which the camera's motion does not explain.",
-            f"No static scene explains the events of a flash, of flicker or of a knock: use a part without ({flag}).",
+            f"{BURST_RATIO} times the usual rate, which the camera's motion does not explain.",
+            "No static scene explains the events of a flash, of flicker or of a knock: use a part without bursts "
+            f"({flag}).",
         )
 
 
@@ -366,8 +366,8 @@ def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
     elif many > MAX_POLARITY_RATIO * few:
         yield Problem(
             f"There are {many / few:.1f} {kind} events for every {other} event.",
-            f"Raise the sensor's threshold of {kind} events; of this recording, check that polarity was read right and "
-            "that no light was switched or dimmed.",
+            f"Check that polarity was read right and that no light was switched or dimmed; for a new recording, raise "
+            f"the sensor's threshold of {kind} events.",
         )
     if statistics.share_below_two > MAX_SHARE_BELOW_TWO:
         yield Problem(
@@ -377,21 +377,21 @@ def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
         )
     if statistics.events_per_pixel < MIN_EVENTS_PER_PIXEL:
         yield Problem(
-            f"There are only {statistics.events_per_pixel:.2g} events a pixel.",
-            f"A picture needs {MIN_EVENTS_PER_PIXEL} and more: use a longer part, record more motion or more texture, "
+            f"There are only {statistics.events_per_pixel:.2g} events per pixel.",
+            f"Learning needs {MIN_EVENTS_PER_PIXEL} and more: use a longer part, record more motion or more texture, "
             "or lower the sensor's thresholds.",
         )
     hot = statistics.num_hot_pixels
     if hot > MAX_SHARE_HOT * statistics.counts.size:
         yield Problem(
             f"The sensor has {_count(hot, 'hot pixel')} ({percent(hot / statistics.counts.size)}), left out here.",
-            "If they lie on bright points of the scene, keep them with --keep-hot-pixels True; else raise the sensor's "
-            "thresholds, let it cool, or mask them in its settings.",
+            "If they see bright points of the scene, keep them with --keep-hot-pixels True. Otherwise raise the "
+            "sensor's thresholds, let it cool, or mask the pixels in its settings.",
         )
 
 
 def _cut_coordinates(statistics: EventStatistics) -> Iterator[Problem]:
-    """Coordinates of which 8 bits were kept: events end at 255, and not because nothing was to be seen there."""
+    """Reports coordinates that were cut to 8 bits: events end at 255, as many there as elsewhere."""
     for name, axis in (("x", 0), ("y", 1)):
         counts = statistics.counts.sum(axis)
         seen, beyond = counts[:256], counts[256:]
@@ -399,12 +399,12 @@ def _cut_coordinates(statistics: EventStatistics) -> Iterator[Problem]:
             yield Problem(
                 f"No event has {name} above 255, though the sensor has {len(counts)} pixels along it, and as many "
                 f"events have {name} = 255 as other values: {name} seems to be cut to 8 bits.",
-                f"Write {name} in 16 bits (numpy.uint16), anew from the source of the events.",
+                f"Write {name} again from the source of the events, in 16 bits (numpy.uint16).",
             )
 
 
 def _coarse_times(recording: EventRecording) -> Iterator[Problem]:
-    """Times that went through float32, of which 24 bits are left: all of them are multiples of its spacing."""
+    """Reports times that were stored as float32, with a significand of 24 bits: all are multiples of its spacing."""
     index = index_events(recording)
     times = np.unique(index.times[:: -(-len(index) // FLOAT_TIMES)].numpy())
     times = times[np.abs(times) >= 2**24]
@@ -412,11 +412,11 @@ def _coarse_times(recording: EventRecording) -> Iterator[Problem]:
         return
     unit = int(np.gcd.reduce(times))
     binary, spacing = unit & -unit, int(np.spacing(np.float32(np.abs(times).max())))
-    if unit == binary or binary < spacing:  # and not because they are whole microseconds, say
+    if unit == binary or binary < spacing:  # otherwise they are multiples of a unit, such as a microsecond
         yield Problem(
-            f"The times of the events are numbers of single precision (float32), which at {times[-1] * 1e-9:.3g} s "
-            f"tell {spacing:,} ns apart and no less.",
-            "Write them as int64, or in double precision (float64), anew from their source.",
+            f"The times of the events are numbers of single precision (float32), which resolve {spacing:,} ns at "
+            f"{times[-1] * 1e-9:.3g} s.",
+            "Write them again from their source, as int64 or in double precision (float64).",
         )
 
 
@@ -426,7 +426,7 @@ def _frame_problems(frames: Frames | None) -> Iterator[Problem]:
     if len(frames.times) < MIN_FRAMES:
         yield Problem(
             f"There {'is' if len(frames.times) == 1 else 'are'} only {_count(len(frames.times), 'frame')}.",
-            "Some are held out to score: use a longer part, or learn from events alone.",
+            "Some of them are held out for scores: use a longer part, or learn from events alone.",
         )
     intervals = np.diff(frames.times)
     if not len(intervals):
@@ -439,8 +439,8 @@ def _frame_problems(frames: Frames | None) -> Iterator[Problem]:
             f"In the sequence of frames {_count(missing, 'frame')} seem to be missing; they come every "
             f"{usual * 1e-6:.3g} ms, but after {frames.times[widest] * 1e-9:.2f} s there is none for "
             f"{intervals[widest] * 1e-9:.3g} s.",
-            "Look whether frames and events show the same at the same time: one lost file or stamp shifts all that "
-            "follow.",
+            "Check that frames and events show the same at the same time: one lost file or stamp shifts all later "
+            "frames.",
         )
 
 
@@ -452,14 +452,14 @@ def _poses_used(recording: EventRecording, statistics: EventStatistics) -> slice
 
 
 def _pose_steps(recording: EventRecording, statistics: EventStatistics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (ns) of the poses around the events, and radians and metres from each to the next."""
+    """Times (ns) of the poses around the events, and the turn (radians) and the way (metres) from each to the next."""
     used = _poses_used(recording, statistics)
     rotations = Rotation.from_quat(recording.trajectory.quaternions[used])
     return recording.trajectory.times[used], *_steps(rotations, recording.trajectory.positions[used])
 
 
 def _steps(rotations: Rotation, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radians and metres from each pose to the next."""
+    """The turn (radians) and the way (metres) from each pose to the next."""
     turns = (rotations[:-1].inv() * rotations[1:]).magnitude()
     return turns, np.linalg.norm(np.diff(positions, axis=0), axis=1)
 
@@ -472,17 +472,17 @@ def _extent(recording: EventRecording, statistics: EventStatistics) -> float:
 def _viewing_distance(
     recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
 ) -> float:
-    """Metres to the scene: the middle of its range, else about as far as the path is long."""
+    """Distance of the scene, metres: the geometric mean of its depth range, else the extent of the path."""
     return math.sqrt(depth_range[0] * depth_range[1]) if depth_range else _extent(recording, statistics) or 1.0
 
 
 def _spans(chosen: np.ndarray, edges: np.ndarray) -> Int64[np.ndarray, "spans 2"]:
-    """Begin and end of each run of bins that are chosen."""
+    """Begin and end of each run of chosen bins."""
     return edges[np.flatnonzero(np.diff(chosen, prepend=False, append=False))].reshape(-1, 2)
 
 
 def _time_range_without(spans: np.ndarray, statistics: EventStatistics) -> str:
-    """The flag that selects the longest part of the events which none of the spans (ns) touches, in milliseconds."""
+    """The flag for the longest time range of the events that touches none of the spans (ns), in whole milliseconds."""
     spans = spans[np.argsort(spans[:, 0])]
     begins = np.maximum.accumulate(np.concatenate([statistics.edges[:1], spans[:, 1]]))
     ends = np.concatenate([spans[:, 0], statistics.edges[-1:]])

@@ -1,4 +1,4 @@
-"""What a recording states of its sensor, beside what its events and frames tell."""
+"""Sensor parameters that a recording states, beside those that its events and frames show."""
 
 from __future__ import annotations
 
@@ -20,37 +20,38 @@ from enerf_ns.dataparsers.sensor_estimates.estimates import (
 )
 
 CONTRADICTED = 3.0
-"""Standard errors by which what is stated must miss what was found to be a problem."""
+"""Standard errors by which a stated value must differ from the measured one to be a problem."""
 
 HARMFUL_MEAN, HARMFUL_RATIO, HARMFUL_PERIOD = 0.2, 0.1, 0.1
-"""Relative differences of the mean threshold, of the ratio of thresholds and of the refractory period below which what
-is stated is near enough."""
+"""Relative differences of the mean threshold, of the ratio of thresholds and of the refractory period, below which a
+stated value is no problem."""
 
 FASTER_EVENTS = 0.01
-"""Largest share of intervals between events of a pixel that are shorter than a refractory period; jitter makes some."""
+"""Largest share of intervals between events of a pixel that are shorter than the refractory period. Jitter causes
+some."""
 
 
 @dataclass(frozen=True)
 class SensorSurvey:
-    """What events and frames tell of the sensor."""
+    """Parameters of the sensor, measured from events and frames."""
 
     recording: EventRecording
     refractory_period: Estimate | None
-    """ns; None where events show none."""
+    """Refractory period, ns. None if the events show none."""
     contrast_thresholds: tuple[Estimate, Estimate]
     """C_on and C_off."""
     is_mean_measured: bool
     """Whether the mean of the thresholds is measured, and not only their ratio."""
     threshold_spread: Estimate | None
-    """Relative standard deviation from pixel to pixel; None where it cannot be told from 0."""
+    """Relative standard deviation of the thresholds over pixels. None if it does not differ significantly from 0."""
     noise_per_event: Estimate
-    """Squared mean thresholds."""
+    """Variance that each event adds, in squared mean thresholds."""
     bursts: FrameBursts | None
     """Bursts of events that come with frames."""
 
     @classmethod
     def of(cls, recording: EventRecording) -> SensorSurvey:
-        """Looks at the events, and at the frames of the same camera; takes seconds.
+        """Measures the sensor from events, and from frames of the same camera. Takes seconds.
 
         Raises:
             RecordingError: The events or a frame cannot be used.
@@ -71,32 +72,32 @@ class SensorSurvey:
         )
 
     def rows(self) -> dict[str, str]:
-        """What is stated and what was found, by name."""
+        """Stated and measured parameters in words, by name."""
         recording, (on, off) = self.recording, self.contrast_thresholds
         stated = recording.contrast_thresholds
-        told = f"{_with_error(on)} on, {_with_error(off)} off: {on.why}"
+        measured = f"{_with_error(on)} on, {_with_error(off)} off: {on.why}"
         if not self.is_mean_measured and math.isfinite(on.error):
-            told = f"C_on = {on.value / off.value:.3g} ± {self._ratio_error:.1g} C_off: {on.why}"
+            measured = f"C_on = {on.value / off.value:.3g} ± {self._ratio_error:.1g} C_off: {on.why}"
         period, spread, noise = self.refractory_period, self.threshold_spread, self.noise_per_event
-        rows = {"thresholds": ("{:.3g} on, {:.3g} off stated; ".format(*stated) if stated else "") + told}
+        rows = {"thresholds": ("{:.3g} on, {:.3g} off stated; ".format(*stated) if stated else "") + measured}
         rows["refractory"] = f"{recording.refractory_period * 1e-6:g} ms stated; " * bool(recording.refractory_period)
-        rows["refractory"] += f"{_with_error(period, 1e-6)} ms: {period.why}" if period else "events show none"
+        rows["refractory"] += f"{_with_error(period, 1e-6)} ms: {period.why}" if period else "the events show none"
         rows["spread"] = (
             f"thresholds differ by {_with_error(spread, 100)} % from pixel to pixel: {spread.why}"
             if spread
-            else "of thresholds from pixel to pixel: cannot be told from 0"
+            else "of thresholds from pixel to pixel: not significantly different from 0"
         )
         rows["noise"] = (
-            f"{_with_error(noise)} squared thresholds an event: {noise.why}"
+            f"{_with_error(noise)} squared thresholds per event: {noise.why}"
             if math.isfinite(noise.error)
             else f"unknown: {noise.why}"
         )
         if recording.has_frames:
-            rows["frame bursts"] = self.bursts.words() if self.bursts else "none: events do not come with frames"
+            rows["frame bursts"] = self.bursts.words() if self.bursts else "none at the stamps of the frames"
         return rows
 
     def problems(self) -> list[Problem]:
-        """What is stated of the sensor and contradicted by events or frames."""
+        """Stated parameters that events or frames contradict."""
         return [*self._threshold_problems(), *self._period_problems()]
 
     @property
@@ -119,15 +120,15 @@ class SensorSurvey:
                 f"Events explain the frames best with thresholds of {_with_error(on)} (on) and {_with_error(off)} "
                 f"(off), but {stated}.",
                 "Check the thresholds, whether the frames are linear in brightness and not gamma-encoded, and the "
-                "response that is stated; where frames and events are learnt from together, they contradict.",
+                "response that is stated; otherwise frames and events contradict each other in training.",
             )
             return
         ratio, stated_ratio = on.value / off.value, stated_on / stated_off
         if abs(ratio - stated_ratio) > max(CONTRADICTED * self._ratio_error, HARMFUL_RATIO * ratio):
             yield Problem(
-                f"The events of both polarities balance where C_on = {ratio:.3g} ± {self._ratio_error:.1g} C_off, but "
+                f"The events of both polarities balance if C_on = {ratio:.3g} ± {self._ratio_error:.1g} C_off, but "
                 f"{stated}, which is {stated_ratio:.3g}.",
-                "Check the thresholds of on and of off events, and that no light was switched or dimmed.",
+                "Check the thresholds of on and off events, and that no light was switched or dimmed.",
             )
 
     def _period_problems(self) -> Iterator[Problem]:
@@ -150,7 +151,7 @@ class SensorSurvey:
 
 
 def _with_error(estimate: Estimate, scale: float = 1.0) -> str:
-    """A value and its standard error, or that it is assumed."""
+    """A value and its standard error in words. An infinite error marks an assumed value."""
     if not math.isfinite(estimate.error):
         return f"{scale * estimate.value:.3g} (assumed)"
     return f"{scale * estimate.value:.3g} ± {scale * estimate.error:.1g}"

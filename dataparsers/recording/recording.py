@@ -383,6 +383,12 @@ class EventRecording:
         """Whether there are sharp or blurred frames."""
         return self.frames is not None or self.blurred_frames is not None
 
+    @property
+    def camera_frames(self) -> Frames | None:
+        """Frames that a camera took: the sharp ones, else the blurred ones, unless those are reconstructed from
+        events."""
+        return self.frames or (self.blurred_frames if self.reconstructed_by is None else None)
+
     def locate(self, index: int) -> str:
         """Returns the file, and the line or number, of event number `index` of the stream, for error messages."""
         if self.locate_event:

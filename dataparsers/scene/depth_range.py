@@ -1,4 +1,4 @@
-"""How near and how far the scene lies, from events and poses alone."""
+"""Depth range of a scene, from events and poses alone, by a plane sweep."""
 
 from __future__ import annotations
 
@@ -18,38 +18,55 @@ from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 
-GRID_WIDTH = 240  # at most, of the view that votes are cast into: coarse enough for the number of events
+GRID_WIDTH = 240
+"""Largest width of the grid that rays cast their votes into, pixels: coarse enough for the number of events."""
+
 TILE = 16
+"""Side of a tile, grid pixels."""
+
 EVENTS_PER_SWEEP = 20_000
-DISPARITIES = np.concatenate([np.arange(0.0, 8.0, 0.5), np.arange(8.0, 65.0)])  # grid pixels
-SMALLEST_DISPARITY, LARGEST_DISPARITY = 2.0, 60.0  # of a peak inside the swept range
-MIN_PEAK = 2.5  # of the dispersion of votes, relative to its median over the planes
-MIN_GAIN = 1.5  # relative to the plane at infinity
-MIN_VOTES = 0.1  # a grid pixel
+"""Most events of one plane sweep."""
+
+DISPARITIES = np.concatenate([np.arange(0.0, 8.0, 0.5), np.arange(8.0, 65.0)])
+"""Disparities of the planes, grid pixels."""
+
+SMALLEST_DISPARITY, LARGEST_DISPARITY = 2.0, 60.0
+"""Limits of the disparity of a peak, grid pixels, inside the range of the planes."""
+
+MIN_PEAK = 2.5
+"""Smallest dispersion of the votes at a peak, relative to the median over the planes."""
+
+MIN_GAIN = 1.5
+"""Smallest dispersion of the votes at a peak, relative to the plane at infinity."""
+
+MIN_VOTES = 0.1
+"""Fewest votes per grid pixel at a peak."""
 
 FARTHEST_DISPARITY = 8.0
-"""Grid pixels by which the farthest depth of a range should move against infinity, so that the two are told apart."""
+"""Disparity (grid pixels) at which the sweep for `measure_share_beyond` places the farthest depth, so that it differs
+clearly from infinity."""
 
 MIN_TILES = 20
-"""Fewest tiles with a depth that show parallax; of cameras that only turn, chance makes a dozen look so."""
+"""Fewest tiles with a depth that show parallax. If a camera only turns, about a dozen have one by chance."""
 
 MIN_CHANCE_RATIO = 3.0
-"""Least ratio of tiles with a depth to tiles that look so by chance; for cameras that only turn it stays below 2."""
+"""Smallest ratio of tiles with a depth to those by chance. If a camera only turns, it stays below 2."""
 
 EVENTS_FOR_DEPTH = 4_000_000
-"""Number of events that measure the depth of the scene, where there are more."""
+"""Most events that measure the depth of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class Parallax:
-    """What the events of a moving camera show of near and far; its planes behind the camera are the control."""
+    """Depths at which a moving camera saw events, with planes behind the camera as the control."""
 
     depths: Float64[np.ndarray, " tiles"]
-    """Metres, along the optical axis, of all tiles whose votes pile up clearly at one plane."""
+    """Depths along the optical axis, metres, of all tiles whose votes have a clear peak at one plane."""
     num_by_chance: int
-    """Tiles whose votes pile up as clearly behind the camera, where nothing is seen: as many of `depths` are wrong."""
+    """Number of tiles with a clear peak behind the camera, where nothing is seen. About as many of `depths` are
+    wrong."""
     num_at_infinity: int
-    """Tiles whose votes pile up clearly at infinity, so that the camera's rotation alone explains them."""
+    """Number of tiles with a clear peak at infinity, which the camera's rotation alone explains."""
     extent: float
     """Diagonal of the box around the camera's path, metres."""
 
@@ -60,7 +77,7 @@ class Parallax:
 
     @property
     def is_ruled_out(self) -> bool:
-        """Whether the camera is seen to turn only, or the scene to be far beyond the reach of its motion."""
+        """Whether the camera only turns, or the whole scene is too far away for the camera's motion."""
         moves = self.extent > 0 and self.num_at_infinity <= len(self.depths) + self.num_by_chance
         return not self.is_shown and not moves
 
@@ -72,10 +89,14 @@ class Parallax:
 
 
 def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
-    """Nearest and farthest depth in metres: the one stated, the recording's own, or measured from its events.
+    """Nearest and farthest depth of a scene, metres.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        stated: Range that is returned if it is given. Default: the recording's own range, else a measured one.
 
     Raises:
-        FlagError: What is stated is no range.
+        FlagError: `stated` is no range.
         RecordingError: The events do not show how deep the scene is.
     """
     if stated is None:
@@ -100,36 +121,37 @@ def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
 
 @cache
 def recording_parallax(recording: EventRecording) -> Parallax:
-    """What a recording's events show of near and far; takes seconds, and is done once for a recording in a process."""
+    """The parallax of a recording's events. Takes seconds, once for each recording in a process."""
     return measure_parallax(_posed_events(recording), recording.camera, recording.trajectory)
 
 
 @cache
 def share_beyond(recording: EventRecording, depth_range: tuple[float, float]) -> float:
-    """Share of a recording's events that come from beyond a range of depth (nearest, farthest; metres), 0 to 1.
+    """Share of a recording's events that come from beyond a depth range (nearest, farthest; metres), from 0 to 1.
 
-    See `measure_share_beyond`; it takes a second, and is done once for a recording and a range in a process.
+    `measure_share_beyond` measures it. Takes a second, once for each recording and range in a process.
     """
     return measure_share_beyond(_posed_events(recording), recording.camera, recording.trajectory, depth_range)
 
 
 def _posed_events(recording: EventRecording) -> Events:
-    """Some of the events, outside the gaps of the poses that are left out."""
+    """At most `EVENTS_FOR_DEPTH` of the events, without those in gaps of the poses that are left out."""
     events = index_events(recording).events(at_most=EVENTS_FOR_DEPTH)
     posed = ~recording.in_left_out_gaps(events.t)
     return Events(events.x[posed], events.y[posed], events.t[posed], events.p[posed])
 
 
 def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> Parallax:
-    """At which depths the event camera saw the scene, and how much of that is chance.
+    """Depths at which the event camera saw the scene, and how many of them are chance.
 
-    A space sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018): the viewing rays of the events of
-    an edge meet where the edge is. Rays from within half a baseline of a reference view are cut by planes parallel to
-    its image, evenly spaced in disparity. Where the cuts pile up is told, for each tile of the view, by the dispersion
-    (variance over mean) of their counts; the variance is the objective of Gallego et al., "A Unifying Contrast
-    Maximization Framework", CVPR 2018. Nothing depends on the unit of length: baselines are the extent of the camera's
-    path and its halvings. The same planes behind the camera, where rays of a scene never meet, are the control: where
-    there is no parallax, or only noise of the poses, votes pile up there as often as in front.
+    This is a plane sweep (Rebecq et al., "EMVS: Event-based Multi-View Stereo", IJCV 2018). The viewing rays of the
+    events of an edge meet at the edge. Planes parallel to the image of a reference view, evenly spaced in disparity,
+    cut the rays from within half a baseline of that view. Each cut is a vote in the grid of the view. The dispersion
+    (variance over mean) of the votes in a tile peaks at the plane where the rays meet. The variance is the objective of
+    Gallego et al., "A Unifying Contrast Maximization Framework", CVPR 2018. The unit of length has no influence:
+    baselines are the extent of the camera's path and its halvings. The same planes behind the camera, where rays of a
+    scene never meet, are the control. Without parallax, or with noise of the poses alone, there are as many peaks
+    behind the camera as in front.
 
     Args:
         events: In time order, within the span of the trajectory.
@@ -151,11 +173,11 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
 def measure_share_beyond(
     events: Events, camera: Camera, trajectory: Trajectory, depth_range: tuple[float, float]
 ) -> float:
-    """Share of the events that no depth of a range explains, since they come from beyond it; 0 to 1.
+    """Share of the events that come from beyond a depth range, from 0 to 1.
 
-    The sweep of `measure_parallax`, at one baseline, at which the farthest depth lies FARTHEST_DISPARITY from infinity.
-    A tile's votes lie beyond where they pile up more at some plane between the farthest depth and infinity than at all
-    planes of the range; ties of noise go to the range, which has more planes.
+    This is the plane sweep of `measure_parallax`, at the baseline that places the farthest depth FARTHEST_DISPARITY
+    from infinity. A tile's votes lie beyond if their dispersion is larger at some plane between the farthest depth and
+    infinity than at all planes of the range. Noise favours the range, which has more planes.
 
     Args:
         events: In time order, within the span of the trajectory.
@@ -164,7 +186,7 @@ def measure_share_beyond(
         depth_range: Nearest and farthest depth, metres.
 
     Returns:
-        0 also where the camera moves too little to tell the farthest depth from infinity.
+        0 also if the camera moves too little to distinguish the farthest depth from infinity.
     """
     near, far = depth_range
     path, focal = _path(events, trajectory), grid_focal_length(camera)
@@ -184,7 +206,7 @@ def measure_share_beyond(
 
 
 def _path(events: Events, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Times (ns) evenly spread over the events, and the places of the camera then (metres); none without events."""
+    """Evenly spaced times (ns) from the first event to the last, and the camera's places (metres) at these times."""
     if not len(events):
         return np.empty(0, np.int64), np.empty((0, 3))
     path_times = evenly_spaced(events.t[0], events.t[-1], 2000)
@@ -200,7 +222,8 @@ def _sweeps(
     baselines: Iterable[float],
     disparities: Float64[np.ndarray, " planes"],
 ) -> Iterator[tuple[float, Float64[np.ndarray, "2 planes tiles"]]]:
-    """Each baseline (metres) with what `sweep_planes` found of each of its reference views; none if nothing moves."""
+    """Each baseline (metres) with the result of `sweep_planes` for each of its reference views. Nothing for a camera
+    that stays in one place."""
     if not _extent(path[1]):
         return
     directions, generator = camera.pixel_directions(), np.random.default_rng(0)
@@ -219,6 +242,7 @@ def _sweeps(
 
 
 def _extent(path: np.ndarray) -> float:
+    """Diagonal of the box around places, metres."""
     return float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
 
 
@@ -228,12 +252,13 @@ def grid_focal_length(camera: Camera) -> float:
 
 
 def grid_scale(camera: Camera) -> float:
-    """Grid pixels a pixel; a grid finer than the sensor would show the sensor's own pixels as a pattern."""
+    """Grid pixels per pixel, at most 1: a finer grid would show the sensor's own pixels as a pattern."""
     return min(GRID_WIDTH / camera.width, 1.0)
 
 
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
-    """Indices of the events around a time, while the camera stays within a radius (metres) of its place then."""
+    """Numbers of the events around a time (ns) while the camera is within a radius (metres) of its place at that
+    time."""
     now = np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1)
     outside = np.flatnonzero(np.linalg.norm(path - path[now], axis=1) > radius)
     limits = np.concatenate([[0], outside, [len(path_times) - 1]])
@@ -247,7 +272,7 @@ def rays_in_view(
     poses: Float64[np.ndarray, "rays 3 4"],
     view: Float64[np.ndarray, "3 4"],
 ) -> tuple[Float64[np.ndarray, "rays 3"], Float64[np.ndarray, "rays 3"]]:
-    """Directions (z = 1) and centres of rays in the axes of a view; rays that hardly go its way are left out."""
+    """Directions (z = 1) and centres of rays in the axes of a view, without rays that point away from the view."""
     rays = np.einsum("nij,nj->ni", poses[:, :, :3], directions) @ view[:, :3]
     centres = (poses[:, :, 3] - view[:, 3]) @ view[:, :3]
     ahead = rays[:, 2] > 0.1
@@ -260,9 +285,16 @@ def sweep_planes(
     camera: Camera,
     disparities: Float64[np.ndarray, " planes"],
 ) -> Float64[np.ndarray, "2 planes tiles"]:
-    """Dispersion of the votes, and votes a grid pixel, of each tile of the view at each plane.
+    """Dispersion of the votes, and votes per grid pixel, of each tile of the view at each plane.
 
-    A ray a (z = 1) from c meets the plane of depth z at c + (z - c_z) a, which the view sees at a + (c - c_z a) / z.
+    The view sees the point c + (z - c_z) a, at which a ray of direction a (z = 1) from c cuts the plane of depth z, in
+    the direction a + (c - c_z a) / z.
+
+    Args:
+        rays: Directions, z = 1, in the axes of the view.
+        centres: Their origins, in units of the baseline.
+        camera: Of the view.
+        disparities: Of the planes, grid pixels: focal length times baseline over depth.
     """
     scale, focal = grid_scale(camera), grid_focal_length(camera)
     columns, rows = (round(side * scale) // TILE for side in (camera.width, camera.height))
@@ -283,7 +315,7 @@ def _vote(start, drift, approach, disparities, counts, votes, squares):
         for ray in range(len(start)):
             x = start[ray, 0] + disparity * drift[ray, 0] + 0.5
             y = start[ray, 1] + disparity * drift[ray, 1] + 0.5
-            if 0.0 <= x < width and 0.0 <= y < height:  # magnification shall not look like focus
+            if 0.0 <= x < width and 0.0 <= y < height:  # weighted by area, so that magnification is no sharpness
                 counts[int(y), int(x)] += (1.0 - disparity * approach[ray]) ** 2
         for row in range(height):
             for column in range(width // TILE):
@@ -300,7 +332,7 @@ def _vote(start, drift, approach, disparities, counts, votes, squares):
 def _clear_disparities(
     dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
 ) -> Float64[np.ndarray, " clear"]:
-    """Disparities, of DISPARITIES, of the tiles whose votes pile up clearly at one plane."""
+    """Disparities of the tiles whose votes have a clear peak at one plane."""
     peak = dispersion.argmax(0)[None]
     disparity = DISPARITIES[peak]
     clear = (
@@ -315,7 +347,7 @@ def _clear_disparities(
 def _num_at_infinity(
     dispersion: Float64[np.ndarray, "planes tiles"], votes: Float64[np.ndarray, "planes tiles"]
 ) -> int:
-    """Number of tiles whose votes pile up clearly at infinity, in front and behind."""
+    """Number of tiles whose votes have a clear peak at infinity, among the planes in front and behind."""
     peak = dispersion.argmax(0)
     clear = (dispersion.max(0) > MIN_PEAK * np.median(dispersion, 0)) & (votes[0] > MIN_VOTES)
     return np.count_nonzero(clear & (DISPARITIES[peak % len(DISPARITIES)] < SMALLEST_DISPARITY))

@@ -1,4 +1,4 @@
-"""Where the scene lies, in the recording's world and in Nerfstudio's box of size 2."""
+"""The box around a scene, and the transform to Nerfstudio's box of size 2."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 def scene_normalisation(
     recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Where the scene lies, seen from all poses of the event camera that are used, between nearest and farthest depth.
+    """Transform and scale from the world to the scene, and the box of all that the event camera sees in the depth
+    range.
 
     Args:
-        recording: Trajectory and camera.
-        near: Nearest depth in metres.
-        far: Farthest depth in metres.
-        cube: Middle and half side in metres of a cube along the axes of the world, where the scene is known to be.
+        recording: Its camera is placed at all poses that are used.
+        near: Nearest depth, metres.
+        far: Farthest depth, metres.
+        cube: Middle (x, y, z) and half side, metres, of a cube along the axes of the world that holds the scene.
+            Default: the box of all that the camera sees.
 
     Returns:
-        transform (3, 4) and scale, so that a world point p becomes scale * (transform @ [p, 1]): the mean up direction
-        of the cameras turned to +z, the middle of what they see moved to the origin; and the box (2, 3) of what they
-        see, in scene units, whose longest side is 2. Of a cube, the world is not turned.
+        transform (3, 4) and scale: a world point p lies at scale * (transform @ [p, 1]) in the scene. The transform
+        turns the mean up direction of the cameras to +z, and moves the middle of the box to the origin. The box (2, 3)
+        is in scene units, and its longest side is 2. With a cube, the transform does not turn the world.
     """
     if cube is not None:
         return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])

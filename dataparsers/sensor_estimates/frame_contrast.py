@@ -103,9 +103,7 @@ def thresholds_from_frames(
     Raises:
         RecordingError: The file of a frame is missing or cannot be decoded.
     """
-    frames = recording.frames
-    if frames is None and recording.reconstructed_by is None:
-        frames = recording.blurred_frames
+    frames = recording.camera_frames
     if frames is None or frames.camera != recording.camera or frames.trajectory is not recording.trajectory:
         return None
     comparison = _Comparison(recording, index_events(recording), frames)

@@ -431,10 +431,10 @@ class _Resolver:
         words: dict[str, list[str]] = {"clock": [], "lens": []}
         if found is not None:
             delay, lens = found
-            if starts and delay.is_told:
+            if starts and delay.is_identifiable:
                 has_frames = recording.has_frames and not recording.reconstructed_by
                 frames = clock_of_frames(recording, (self._distance, self._distance)) if has_frames else None
-                if frames is not None and frames.is_told:
+                if frames is not None and frames.is_identifiable:
                     lag = min(frames.value, 0.0)
                     if abs(delay.value - frames.value) < 2.0 * delay.error:
                         delay = frames  # on one clock, which frames tell better
@@ -965,7 +965,7 @@ class _Resolver:
 def _is_wrong(estimate: AgreementEstimate, stated: float, smallest: float) -> bool:
     """Whether a value is told to differ from what is stated, and by more than the smallest that matters."""
     apart = abs(estimate.value - stated)
-    return estimate.is_told and apart > max(smallest, 3.0 * estimate.error)
+    return estimate.is_identifiable and apart > max(smallest, 3.0 * estimate.error)
 
 
 def _path_extent(recording: EventRecording) -> float:

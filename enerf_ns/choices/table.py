@@ -75,7 +75,7 @@ def findings_table(found: Sequence[Finding]) -> Table:
     table = _table("Clock, poses and lens", caption, ("part", "", "found", "moves the picture by", "flag"))
     for row in found:
         kept = "[green]corrected[/green]" if row.is_corrected else "[dim]as stated[/dim]"
-        value = row.value if row.is_told else f"not told ({row.value})"
+        value = row.value if row.is_identifiable else f"not identifiable ({row.value})"
         moved = f"{row.pixels:.2g} pixels" if row.is_corrected else ""
         table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(PREFIX), "dim"))
     return table

@@ -1,4 +1,4 @@
-"""What one training step looks at: pairs of instants of pixels of the event camera, and pixels of frames."""
+"""Batches of one training step: pairs of instants of event pixels, and pixels of frames."""
 
 from __future__ import annotations
 
@@ -11,45 +11,45 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Pixels, each with two instants and the events that it fired between them, the second instant included."""
+    """Pairs: a pixel, two instants, and the number of events that it fired after the first one, up to the second."""
 
     pixels: Int64[Tensor, " pairs"]
     """Number of the pixel of each pair, y * width + x."""
     start: Int64[Tensor, " pairs"]
-    """First instant of each pair, ns; of a pair of events, that of its first event."""
+    """First instant of each pair, ns. In a pair of events, it is the time of the first event."""
     end: Int64[Tensor, " pairs"]
-    """Second instant of each pair, ns; later than the first, or that one again, where there was no pair to draw."""
+    """Second instant of each pair, ns. It equals the first one if there was no pair to draw."""
     on: Int64[Tensor, " pairs"]
-    """Number of positive events of each pair, after the first instant and up to and with the second."""
+    """Number of positive events of each pair."""
     off: Int64[Tensor, " pairs"]
-    """Number of negative events of each pair, after the first instant and up to and with the second."""
+    """Number of negative events of each pair."""
     num_silent: int = 0
-    """Number of pairs of silent pixels, whose instants are any between two of their events; they come last."""
+    """Number of pairs of silent pixels, with two instants between successive events. They come last."""
     num_any: int = 0
-    """Number of pairs of any two instants, whatever the pixel fired between them; they come before silent ones."""
+    """Number of pairs of any two instants, with or without events between them. They come before the silent pairs."""
     starts_at_events: bool = True
-    """Whether the pairs of events begin at events, after which pixels may be blind; windows of time do not."""
+    """Whether pairs of events begin at events, after which pixels may be blind. Windows of time do not."""
     rates: Float[Tensor, "pairs 2 2"] | None = None
-    """Events a second around the first and the second instant of each pair, on and off (`samplers.rates_around`); None
-    where nobody needs them."""
+    """Events per second around the first and the second instant of each pair, on and off (`samplers.rates_around`).
+    None if the sensor model needs no rates."""
     ahead: Float[Tensor, " pairs"] | None = None
-    """Thresholds by which log brightness changed more than the events between the instants say, as far as that is known
-    of instants that are no events. None: 0."""
+    """Expected change of log brightness beyond the sum of the events, in thresholds, for instants that are no events.
+    None: 0."""
     slopes: Float[Tensor, "pairs 2"] | None = None
-    """By how much rendered log brightness changes a second at either instant, of the first pairs; 0 of the others. None
-    where nobody needs it."""
+    """Slope of the rendered log brightness at either instant, per second, for the first pairs, and 0 for the others.
+    None if the sensor model needs no slopes."""
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     @property
     def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What is known of each pair, in the order of the fields."""
+        """pixels, start, end, on and off."""
         return self.pixels, self.start, self.end, self.on, self.off
 
     @property
     def fired(self) -> slice:
-        """Which pairs are of events, or of any instants."""
+        """Slice of the pairs of events and of any instants."""
         return slice(len(self) - self.num_silent)
 
     @property
@@ -59,22 +59,25 @@ class EventBatch:
 
     @property
     def of_events(self) -> slice:
-        """Which pairs are of events."""
+        """Slice of the pairs of events."""
         return slice(self.num_of_events)
 
     @property
     def of_any(self) -> slice:
-        """Which pairs are of any instants."""
+        """Slice of the pairs of any instants."""
         return slice(self.of_events.stop, self.fired.stop)
 
     @property
     def silent(self) -> slice:
-        """Which pairs are of silent pixels."""
+        """Slice of the pairs of silent pixels."""
         return slice(len(self) - self.num_silent, None)
 
     def followed_by(self, others: EventBatch) -> EventBatch:
-        """A batch of these pairs, none of which is of a silent pixel, and then of others, whose instants are no events:
-        those of silent pixels, or of any instants."""
+        """These pairs, and then the pairs of another batch.
+
+        Args:
+            others: Pairs of silent pixels or of any instants. This batch must hold no silent pairs.
+        """
         columns = zip(self.columns, others.columns, strict=True)
         joined = (torch.cat(both) for both in columns)
         rates = None if self.rates is None else torch.cat([self.rates, self.rates.new_zeros(len(others), 2, 2)])
@@ -94,7 +97,7 @@ class EventBatch:
         )
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
-        """The pairs that are chosen."""
+        """The chosen pairs."""
         columns = (column[chosen] for column in self.columns)
         num_silent, num_any = int(chosen[self.silent].sum()), int(chosen[self.of_any].sum())
         rates, ahead, slopes = (
@@ -113,38 +116,41 @@ class EventBatch:
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Pixels of frames, each the mean of what it saw at instants of its exposure."""
+    """Pixels of frames. The colour of each is the mean over some instants of its exposure."""
 
     indices: Int64[Tensor, "pixels 3"]
     """Frame, row and column of each pixel."""
     times: Int64[Tensor, "pixels instants"]
     """Instants at which each pixel is rendered, ns."""
     colours: Float[Tensor, "pixels 3"]
-    """Colours that were recorded at the pixels, in [0, 1]."""
+    """Recorded colours of the pixels, in [0, 1]."""
     are_grey: bool
-    """Whether the frames have no colour anywhere."""
+    """Whether all frames are grey."""
 
     def subset(self, chosen: Bool[Tensor, " pixels"]) -> FrameBatch:
-        """The pixels that are chosen."""
+        """The chosen pixels."""
         return FrameBatch(self.indices[chosen], self.times[chosen], self.colours[chosen], self.are_grey)
 
 
 @dataclass(frozen=True)
 class TrainBatch:
-    """A batch of events, of frames, or of both. Its rays are rendered in one go: all starts, all ends, all pixels of
-    frames, of each pixel all instants."""
+    """A batch of events, of frames, or of both.
+
+    Its rays are rendered together, in this order: the first instants of all pairs, their second instants, and the
+    pixels of frames with all instants of each.
+    """
 
     events: EventBatch | None
     frames: FrameBatch | None
 
     @property
     def num_pairs(self) -> int:
-        """Number of pairs of instants, of events and of silent pixels."""
+        """Number of pairs of instants, silent ones included."""
         return 0 if self.events is None else len(self.events)
 
     def split(self, rendered: Float[Tensor, "rays channels"]) -> tuple[Tensor, Tensor, Tensor]:
-        """What was rendered at the first instants (pairs, channels), at the second ones, and of the frames (pixels,
-        channels), whose light adds up over their instants."""
+        """Splits rendered rays into first instants (pairs, channels), second instants (pairs, channels), and pixels of
+        frames (pixels, channels), which are means over their instants."""
         pairs = self.num_pairs
         frames = rendered[2 * pairs :]
         if self.frames is not None:

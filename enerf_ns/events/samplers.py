@@ -1,4 +1,4 @@
-"""Which instants of which pixels a training step compares: pairs of events, and silent pixels."""
+"""Samplers of the pixels and instants that a training step compares: pairs of events, and silent pixels."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.events.batch import EventBatch
 
 MOST_DRAWS = 64
-"""Pairs that are drawn for one that is kept, at most."""
+"""Largest number of draws for one pair that is kept."""
 
 CHUNK = 2**20
-"""Events looked at together while the pairs are counted, so that this needs little memory beside the index."""
+"""Events that are handled at once while pairs are counted, which limits memory."""
 
 
 class EventPairSampler:
     """Draws pairs of events of one pixel.
 
-    Events of one pixel with the same time stamp are one instant, so that a pair never has zero length. With i the
-    number of an instant of a pixel, the pairs are
+    Events of one pixel with the same time stamp are one instant, so that no pair has zero length. With i the number of
+    an instant of a pixel, the pairs are
 
     * successor: (i, i + 1), the default of E-NeRF;
     * partner: (i, i + d) with every distance d from 1 to `max_distance`;
-    * window: time is cut into windows of `window_ns` from the first event on, and the pair is (i, last instant of this
+    * window: windows of `window_ns` divide the time from the first event on, and the pair is (i, last instant of this
       pixel in the same window), the 60 ms ablation of E-NeRF.
 
-    Where pixels are blind for a while after an event (`SensorModel.blind_after`), pairs of successors are exact.
-    Between the events of other pairs the pixel is blind too, and what changes meanwhile is missing from the sum of
-    their events: these pairs are approximate.
+    If pixels are blind for a while after each event (`SensorModel.blind_after`), successor pairs are exact. Other pairs
+    are approximate: the pixel is also blind after the events between the two, and its changes during that time are
+    missing from the sum of the events.
 
-    Where `stretches` leave time out, the instants within it are none: the instants before and after are neighbours, and
-    of their pair, which counts the events between, what was said of the other pairs holds. Windows end there.
+    Instants outside `stretches` do not count. The instants before and after a gap are neighbours, and their pair counts
+    the events in the gap, so that it is approximate, too. Windows end at gaps.
 
     Args:
-        index: The events; batches come out on its device.
-        mode: Which pairs there are.
+        index: The events. Batches are on its device.
+        mode: Kind of the pairs.
         max_distance: For mode partner, at least 1.
         window_ns: For mode window, at least 1.
-        uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are, and so
-            are all pairs of a pixel.
-        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+        uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are equally
+            likely, and so are all pairs of a pixel.
+        stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
 
     Raises:
         ValueError: There is no pair to draw, or an argument is outside its range.
@@ -87,18 +87,18 @@ class EventPairSampler:
         self.num_pairs = int(self._pair_offsets[-1])
         if self.num_pairs == 0:
             where = f" within a window of {window_ns * 1e-6:g} ms" if self.window else ""
-            where += " in the time that is looked at" if stretches is not None else ""
+            where += " in the time that is used" if stretches is not None else ""
             raise ValueError(f"No pixel fired events at two different times{where}, so there is no pair to train on.")
         self._active = self._pair_offsets.diff().nonzero()[:, 0] if uniform_over == "pixels" else None
 
     def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
-        """Draws `batch_size` pairs with replacement; the generator lives on the device of the index.
+        """Draws `batch_size` pairs with replacement.
 
         Args:
-            batch_size: Pairs.
+            batch_size: Number of pairs.
             generator: On the device of the index.
-            blind_ns: Where the rates of events around the instants are to be told, for how long a pixel is blind after
-                an event.
+            blind_ns: How long a pixel is blind after an event, to add the event rates around the instants to the batch.
+                Default: no rates.
         """
         device = self.index.times.device
         if self._active is None:
@@ -131,12 +131,12 @@ class EventPairSampler:
         return self._event(start), self._event(start + distance)
 
     def _event(self, instants: Tensor) -> Tensor:
-        """Numbers of the events that are the instants with these numbers, counted over all pixels."""
+        """Numbers of the events at some instants, which are numbered over all pixels."""
         return instants + torch.searchsorted(self._before_skipped, instants.int(), right=True)
 
 
 def _pairs_of(index: EventIndex, pixels: Tensor, start: Tensor, end: Tensor, blind_ns: int | None) -> EventBatch:
-    """Pairs of events, given by their numbers in the index; arguments as of `EventPairSampler.sample`."""
+    """The batch of pairs of events with given numbers in the index, with rates if `blind_ns` is given."""
     rates = None
     if blind_ns is not None:
         begins = rates_around(index, start, pixels, blind_ns, blind_ns)
@@ -148,20 +148,20 @@ def _pairs_of(index: EventIndex, pixels: Tensor, start: Tensor, end: Tensor, bli
 def rates_around(
     index: EventIndex, events: Int64[Tensor, " pairs"], pixels: Int64[Tensor, " pairs"], delay_ns: int, blind_ns: int
 ) -> Float32[Tensor, "pairs 2"]:
-    """Events a second of a pixel, on and off, as its signal changes at, or shortly after, one of its events.
+    """Rate of on and off events of a pixel (per second), at or shortly after one of its events.
 
-    Each of the two intervals beside the event holds one event; its rate is that of the middle of the time during which
-    the pixel saw. The rate at the instant is interpolated between both middles, so that of a signal with a constant
-    second derivative it is exact. Where the signal turns before the next event, it has nearly come to rest: then it is
-    half of the rate before, but where the pixel was blind, and the next interval tells what it saw since. Where the
-    pixel has no event before or after, the other interval alone tells.
+    Each of the two intervals beside the event holds one event. Its rate is the rate in the middle of the part of the
+    interval in which the pixel was not blind. The rate at the instant is interpolated between both middles, which is
+    exact for a signal with a constant second derivative. If the signal turns before the next event, it has nearly come
+    to rest, and the rate is half of the rate before. If pixels are blind after an event, the rate is interpolated in
+    this case, too. If a pixel has no event before or after, the other interval alone gives the rate.
 
     Args:
         index: The events.
-        events: Their numbers in the index.
-        pixels: To which they belong.
-        delay_ns: From the event to the instant.
-        blind_ns: For how long a pixel is blind after an event.
+        events: Numbers of the events in the index.
+        pixels: Pixel of each event.
+        delay_ns: Time from the event to the instant.
+        blind_ns: How long a pixel is blind after an event.
     """
     times, positives = index.times, index.positives
     first, last = index.offsets[pixels], index.offsets[pixels + 1] - 1
@@ -182,14 +182,14 @@ def rates_around(
 
 
 class HeldOutPairSampler:
-    """Draws pairs of events of one pixel that both lie within spans of time, whose events are kept from training.
+    """Draws pairs of events of one pixel that both lie within held-out spans of time.
 
-    All pairs that are at most `max_distance` events of the pixel apart are equally likely; as of `EventPairSampler`, no
-    pair has zero length. The two may lie in different spans; events between these count.
+    All pairs that are at most `max_distance` events of the pixel apart are equally likely, and no pair has zero length.
+    The two events may lie in different spans. The events between them count.
 
     Args:
-        index: The events; batches come out on its device.
-        spans: First and last time (ns) of each span, in order and apart.
+        index: The events. Batches are on its device.
+        spans: First and last time (ns) of each held-out span, in order and disjoint.
         max_distance: At least 1.
 
     Raises:
@@ -210,7 +210,7 @@ class HeldOutPairSampler:
             raise ValueError(f"no pixel fired twice, {max_distance} events apart or less, in the time that is held out")
 
     def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
-        """Draws `batch_size` pairs with replacement; arguments as of `EventPairSampler`."""
+        """Draws `batch_size` pairs with replacement, with the arguments of `EventPairSampler.sample`."""
         chosen = torch.randint(len(self._pairs), (batch_size,), generator=generator, device=self._pairs.device)
         pixels, start, end = self._pairs[chosen].long().T
         return _pairs_of(self.index, pixels, start, end, blind_ns)
@@ -219,21 +219,22 @@ class HeldOutPairSampler:
 class SilentPixelSampler:
     """Draws pixels and two instants between which they fired nothing, for the no-event loss of E-NeRF.
 
-    A pixel is drawn uniformly over the sensor, hot pixels left out, and an instant uniformly over the recording, or its
-    stretches; the silent interval around it is bounded by the pixel's neighbouring events, or the ends of the recording
-    or of the stretch, and begins when the pixel can see again. From an interval at least `min_duration_ns` long, two
-    instants are drawn uniformly, at most `max_duration_ns` apart, never at an event and never within `held_out`.
+    A pixel is drawn uniformly over the sensor, without hot pixels, and an instant uniformly over the recording or its
+    stretches. The silent interval around the instant ends at the pixel's neighbouring events, or at the ends of the
+    recording or of the stretch. It begins when the pixel is no longer blind. If the interval is at least
+    `min_duration_ns` long, two instants in it are drawn uniformly, at most `max_duration_ns` apart, never at an event
+    and never within `held_out`.
 
-    How many are drawn for one that is kept is found out once, at the first batch: what is drawn has the same shape at
-    every step, so that on a GPU no step waits for numbers.
+    The number of draws for one pair that is kept is measured once, at the first batch. So each step draws tensors of
+    the same shape, and a GPU need not be waited for.
 
     Args:
-        index: The events; batches come out on its device.
+        index: The events. Batches are on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         min_duration_ns: At least 1.
         max_duration_ns: At least 2.
-        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
-        held_out: First and last time (ns) of spans at which no pair starts or ends, in order and apart.
+        stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
+        held_out: First and last time (ns) of spans in which no pair starts or ends, in order and disjoint.
 
     Raises:
         ValueError: A duration is shorter than its minimum, or no stretch lies between start and end.
@@ -263,13 +264,13 @@ class SilentPixelSampler:
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
         """Draws `batch_size` silent pairs (on = off = 0).
 
-        Where silent intervals are so rare that `MOST_DRAWS` a pair hold fewer, those found are used again; where they
-        hold none, two instants of a pair are one.
+        If `MOST_DRAWS` draws per pair find fewer silent intervals, the found ones are used again. If they find none,
+        the two instants of each pair are equal.
 
         Args:
-            batch_size: Pairs.
+            batch_size: Number of pairs.
             generator: On the device of the index.
-            refractory_ns: For how long a pixel is blind after an event.
+            refractory_ns: How long a pixel is blind after an event.
         """
 
         def pairs(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
@@ -284,7 +285,8 @@ class SilentPixelSampler:
     def _silent_intervals(
         self, draws: int, generator: torch.Generator, blind_ns: int
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pixels, first and last silent instant around an instant drawn at random, and which are long enough."""
+        """Random pixels, first and last instant of the silence around a random instant, and whether it is long
+        enough."""
         times, offsets = self.index.times, self.index.offsets
         pixels, instant, start_ns, end_ns = self._moments.draw(draws, generator)
         first, stop = offsets[pixels], offsets[pixels + 1]
@@ -303,12 +305,13 @@ class SilentIntervalSampler:
     """Draws two instants between two successive events of a pixel, for the total variation of Deblur e-NeRF (Low and
     Lee, ECCV 2024).
 
-    All intervals between successive events are equally likely, however long. Within one, which begins when the pixel
-    can see again, two instants are drawn uniformly, never at an event.
+    All intervals between successive events are equally likely, however long. An interval begins when the pixel is no
+    longer blind. Two instants in it are drawn uniformly, never at an event.
 
     Args:
-        index: The events; batches come out on its device.
-        stretches: As of `EventPairSampler`; no interval reaches over a gap.
+        index: The events. Batches are on its device.
+        stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. No interval
+            reaches over a gap. Default: all.
 
     Raises:
         ValueError: There is no interval to draw.
@@ -320,12 +323,12 @@ class SilentIntervalSampler:
         self._draws = _Draws()
 
     def sample(self, batch_size: int, generator: torch.Generator, refractory_ns: int = 0) -> EventBatch:
-        """Draws `batch_size` silent pairs (on = off = 0); where there are few or none, as of `SilentPixelSampler`.
+        """Draws `batch_size` silent pairs (on = off = 0), with the rules of `SilentPixelSampler.sample` for rare ones.
 
         Args:
-            batch_size: Pairs.
+            batch_size: Number of pairs.
             generator: On the device of the index.
-            refractory_ns: For how long a pixel is blind after an event.
+            refractory_ns: How long a pixel is blind after an event.
         """
 
         def pairs(draws: int, generator: torch.Generator) -> tuple[EventBatch, Tensor]:
@@ -340,31 +343,30 @@ class SilentIntervalSampler:
 
 
 AHEAD = 0.2
-"""Thresholds by which log brightness has on average gone on since a pixel's last event, in the direction of that event:
-what is left of the change that fired it, and too little to fire again. Of simulated recordings it is 0.14 to 0.24
+"""Mean change of log brightness since a pixel's last event, in thresholds and in the direction of that event. The
+signal that fired the event goes on, but not far enough to fire again. Simulated recordings have 0.14 to 0.24
 (`benchmarks/instants.py`)."""
 
 
 class InstantPairSampler:
-    """Draws pairs of any two instants of a pixel, and what its events between them add up to.
+    """Draws pairs of any two instants of a pixel, with the sum of its events between them.
 
-    A pair of events says exactly by how much the brightness of a pixel's area changed, but at instants at which an edge
-    goes through the pixel, where a ray through its centre sees something else. Instants that are drawn alike over time
-    mostly lie between edges. There a ray sees what the pixel sees, and the events up to then tell its brightness within
-    half a threshold (root mean square). What is left of that is on average in the direction of the last event:
-    `EventBatch.ahead`. Pairs are kept whether the pixel fired between their instants or not, since those that fired
-    alone would tell of more contrast than there is.
+    A pair of events gives the exact change of brightness of a pixel's area. But an edge passes through the pixel at
+    these instants, so that a ray through its centre sees another brightness. Random instants mostly lie between edges.
+    There, a ray sees what the pixel sees, and the sum of the events gives its brightness within half a threshold (root
+    mean square). On average, the rest lies in the direction of the last event: `EventBatch.ahead`. Pairs without events
+    are kept, too, since pairs with events alone would show too much contrast.
 
-    A pixel is drawn uniformly over the sensor, hot pixels left out, one instant over the recording, or its stretches,
-    and the other up to `max_duration_ns` before or after it; beyond the first or the last instant it is mirrored there,
-    and from between two stretches it is moved to the beginning of the next, or to the end of the last. Where pixels are
-    blind for a while after an event, what changes meanwhile is missing from the sum.
+    A pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
+    stretches. The other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
+    instant, it is mirrored. Between two stretches, it moves to the beginning of the next stretch; after the last one,
+    to its end. If pixels are blind for a while after an event, changes during that time are missing from the sum.
 
     Args:
-        index: The events; batches come out on its device.
+        index: The events. Batches are on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         max_duration_ns: At least 1.
-        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+        stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
 
     Raises:
         ValueError: The duration is shorter than its minimum, or no stretch lies between start and end.
@@ -384,21 +386,18 @@ class InstantPairSampler:
         self.start_ns, self.end_ns = start_ns, end_ns
         self.max_duration_ns = min(max_duration_ns, max(end_ns - start_ns, 1))
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
-        self._stretches = None
-        if stretches is not None:
-            used = stretches[(stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)]
-            self._stretches = used.clamp(start_ns, end_ns)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs; the generator lives on the device of the index."""
+        """Draws `batch_size` pairs by a generator on the device of the index."""
         pixels, one, _, _ = self._moments.draw(batch_size, generator)
         steps = torch.full_like(one, 2 * self.max_duration_ns + 1)
         other = one + _randint(steps, generator) - self.max_duration_ns
         other = torch.where(other < self.start_ns, 2 * self.start_ns - other, other)
         other = torch.where(other > self.end_ns, 2 * self.end_ns - other, other)
-        if self._stretches is not None:
-            part = _part(other, self._stretches)
-            following = torch.cat([self._stretches[:, 0], self._stretches[-1:, 1]])
+        stretches = self._moments.stretches
+        if stretches is not None:
+            part = _part(other, stretches)
+            following = torch.cat([stretches[:, 0], stretches[-1:, 1]])
             other = torch.where(part % 2 == 0, following[part // 2], other)
         start, end = torch.minimum(one, other), torch.maximum(one, other)
         begin = self.index.offsets[pixels]
@@ -410,26 +409,26 @@ class InstantPairSampler:
         return EventBatch(pixels, start, end, on, off, num_any=batch_size, starts_at_events=False, ahead=ahead)
 
     def _is_on(self, until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
-        """Whether the last of so many first events of the index, of a pixel that has one, is an on event."""
+        """1 if the last of the first `until` events of the index is an on event, else 0."""
         return _positives(self.index, until) - _positives(self.index, (until - 1).clamp(min=0))
 
 
 class AccumulationSampler:
-    """Draws pixels and windows of time, whose events are summed, as EventNeRF does (Rudnev et al., CVPR 2023).
+    """Draws pixels and windows of time whose events are summed, as in EventNeRF (Rudnev et al., CVPR 2023).
 
-    A window ends at an instant drawn uniformly over the recording, or its stretches, and is as long as is drawn
-    uniformly up to `max_duration_ns`, less what lies before the recording or the stretch. A pixel is drawn uniformly
-    over the sensor, hot pixels left out. Of what is drawn so, the pairs are windows in which the pixel fired, and, so
-    that silence counts too, a share `NEGATIVE_SHARE` of any.
+    A window ends at an instant that is drawn uniformly over the recording or its stretches. Its length is drawn
+    uniformly up to `max_duration_ns`, and cut at the beginning of the recording or of the stretch. A pixel is drawn
+    uniformly over the sensor, without hot pixels. The pairs are windows in which the pixel fired, and a share
+    `NEGATIVE_SHARE` of windows with or without events, so that silence counts, too.
 
-    The change over a window is known only up to a threshold at either end, since neither is an event. Where pixels are
-    blind for a while after an event, what changes meanwhile is missing from the sum.
+    The change over a window is known only up to a threshold at either end, since neither end is an event. If pixels are
+    blind for a while after an event, changes during that time are missing from the sum.
 
     Args:
-        index: The events; batches come out on its device.
+        index: The events. Batches are on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         max_duration_ns: At least 1.
-        stretches: First and last time (ns) of each part of time that is used, in order and apart. None: all.
+        stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
 
     Raises:
         ValueError: The duration is shorter than its minimum, or there is no event to draw.
@@ -456,14 +455,15 @@ class AccumulationSampler:
         self._of_fired, self._of_any = _Draws(), _Draws()
 
     def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
-        """Draws `batch_size` pairs; of rates, which belong to events, they tell nothing.
+        """Draws `batch_size` pairs.
 
-        Where events are so rare that `MOST_DRAWS` a pair hold fewer, those found are used again; where they hold none,
-        two instants of a pair are one, and it counts no events.
+        If `MOST_DRAWS` draws per pair find fewer windows with events, the found ones are used again. If they find none,
+        the two instants of each pair are equal, and it counts no events.
 
         Args:
-            batch_size: Pairs.
+            batch_size: Number of pairs.
             generator: On the device of the index.
+            blind_ns: Has no effect, since the ends of windows are no events and have no rates.
         """
         negatives = round(self.NEGATIVE_SHARE * batch_size)
 
@@ -484,7 +484,7 @@ class AccumulationSampler:
         return EventBatch(pixels, start, end, on, off, starts_at_events=False)
 
     def _windows(self, draws: int, generator: torch.Generator) -> EventBatch:
-        """Windows of any length, also 0, at any pixel."""
+        """Windows of any length, 0 included, at random pixels."""
         pixels, end, first, _ = self._moments.draw(draws, generator)
         duration = torch.randint(self.max_duration_ns, (draws,), generator=generator, device=end.device) + 1
         start = (end - duration).clamp(min=first)
@@ -495,42 +495,43 @@ class AccumulationSampler:
 
 
 class _PixelMoments:
-    """Draws pixels, hot ones left out, and instants of the time that is used, all alike; arguments as of samplers."""
+    """Draws pixels, without hot ones, and instants of the time that is used, uniformly. Arguments as in the
+    samplers."""
 
     def __init__(self, index: EventIndex, start_ns: int, end_ns: int, stretches: Int64[Tensor, "stretches 2"] | None):
         self.start_ns, self.end_ns = start_ns, end_ns
         usable = torch.ones(len(index.offsets) - 1, dtype=torch.bool, device=index.times.device)
         usable[index.hot_pixels] = False
         self._pixels = usable.nonzero()[:, 0]
-        self._stretches = None
+        self.stretches = stretches
+        """The stretches between `start_ns` and `end_ns`. None: all of the time."""
         if stretches is not None:
-            begins, ends = stretches.clamp(start_ns, end_ns).T
             used = (stretches[:, 0] <= end_ns) & (stretches[:, 1] >= start_ns)
             if not used.any():
                 raise ValueError("All events lie in one gap of the poses, so that no silence can be drawn.")
-            begins, ends = begins[used], ends[used]
-            after = (ends - begins + 1).cumsum(0)
-            self._stretches = begins, ends, after, int(after[-1])
+            self.stretches = stretches[used].clamp(start_ns, end_ns)
+            self._after = (self.stretches.diff(dim=1)[:, 0] + 1).cumsum(0)
+            self._total = int(self._after[-1])
 
     def draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | int, Tensor | int]:
-        """Pixels, instants, and the first and the last instant of the stretches that these lie in."""
+        """Random pixels, random instants, and the first and the last instant of the stretch around each instant."""
         device = self._pixels.device
         pixels = self._pixels[torch.randint(len(self._pixels), (number,), generator=generator, device=device)]
-        if self._stretches is None:
+        if self.stretches is None:
             instant = torch.randint(self.start_ns, self.end_ns + 1, (number,), generator=generator, device=device)
             return pixels, instant, self.start_ns, self.end_ns
-        begins, ends, after, total = self._stretches
-        place = torch.randint(total, (number,), generator=generator, device=device)
-        stretch = torch.searchsorted(after, place, right=True)
-        return pixels, ends[stretch] + 1 - (after[stretch] - place), begins[stretch], ends[stretch]
+        place = torch.randint(self._total, (number,), generator=generator, device=device)
+        stretch = torch.searchsorted(self._after, place, right=True)
+        begin, end = self.stretches[stretch].T
+        return pixels, end + 1 - (self._after[stretch] - place), begin, end
 
 
 class _Draws:
-    """How many pairs are drawn at random for those that are kept."""
+    """Draws enough random pairs to keep a wanted number."""
 
     def __init__(self) -> None:
         self._kept: float | None = None
-        """Share of what is drawn that is kept, at least."""
+        """Lower bound of the share of draws that are kept."""
 
     def pairs(
         self,
@@ -538,13 +539,14 @@ class _Draws:
         number: int,
         generator: torch.Generator,
     ) -> EventBatch:
-        """The first pairs of those drawn that are kept; where there are fewer, those again, and where there are none,
-        pairs of one instant and no events.
+        """The first kept pairs among those drawn.
+
+        If too few are kept, they are repeated. If none are, the pairs have two equal instants and no events.
 
         Args:
-            draw: Draws so many pairs by a generator, and says which are kept.
-            number: Pairs.
-            generator: That draws them.
+            draw: Draws a number of pairs by a generator, and returns them and whether each is kept.
+            number: Wanted number of pairs.
+            generator: Of the draws.
         """
         if self._kept is None:
             _, kept = draw(max(MOST_DRAWS * number, 1024), torch.Generator(generator.device).manual_seed(0))
@@ -552,7 +554,7 @@ class _Draws:
             self._kept = max(float(sure), 1.0 / MOST_DRAWS)
         spread = 4.0 * math.sqrt(number) + 16.0
         batch, kept = draw(math.ceil(min((number + spread) / self._kept, MOST_DRAWS * (number + 16))), generator)
-        places = kept.logical_not().to(torch.uint8).argsort(stable=True)  # those that are kept come first, in order
+        places = kept.logical_not().to(torch.uint8).argsort(stable=True)  # kept pairs come first, in order
         num_kept = kept.count_nonzero()
         places = places[torch.arange(number, device=kept.device) % num_kept.clamp(min=1)]
         pixels, start, end, on, off = (column[places] for column in batch.columns)
@@ -563,8 +565,10 @@ class _Draws:
 
 
 def _silent_pairs(pixels: Tensor, begin: Tensor, end: Tensor, generator: torch.Generator) -> EventBatch:
-    """Pairs of two different instants of each silent interval, given by its first and last instant; of intervals that
-    hold no two, any."""
+    """Pairs of two different instants in silent intervals, which are given by their first and last instants.
+
+    An interval with a single instant is extended by a nanosecond.
+    """
     instants = (end - begin + 1).clamp(min=2)
     one = _randint(instants, generator)
     other = _randint(instants - 1, generator)
@@ -577,12 +581,13 @@ def _silent_pairs(pixels: Tensor, begin: Tensor, end: Tensor, generator: torch.G
 def _last_of_each(
     index: EventIndex, window_ns: int | None, stretches: Int64[Tensor, "stretches 2"] | None
 ) -> Bool[Tensor, " events"]:
-    """Whether each event is the last of its pixel at this time, or in its window of time since the first event.
+    """Whether each event is the last one of its pixel at its time, or in its window of time.
 
     Args:
         index: The events.
-        window_ns: Length of the windows; None: the same time.
-        stretches: Whose ends end windows too; outside of them no event is the last. None: all of time.
+        window_ns: Length of the windows, which begin at the first event. None: windows of a single time.
+        stretches: Windows also end at the ends of stretches, and no event outside of stretches is a last one. None: all
+            of the time.
     """
     times = index.times
     origin = index.span[0] if window_ns is not None and len(times) else 0
@@ -604,18 +609,18 @@ def _last_of_each(
 
 
 def _part(times: Int64[Tensor, "*times"], stretches: Int64[Tensor, "stretches 2"]) -> Int64[Tensor, "*times"]:
-    """Numbers of the parts that stretches cut time into: 0 before the first, 1 within it, 2 in the gap behind it ..."""
+    """Number of the part of time at each time: 0 before the first stretch, 1 within it, 2 in the gap behind it, …"""
     begins, ends = stretches.T.contiguous()
     return torch.searchsorted(begins, times, right=True) + torch.searchsorted(ends, times)
 
 
 def _positives(index: EventIndex, events: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
-    """Number of positive events among so many first ones of the index."""
+    """Number of positive events among the first `events` events of the index."""
     return torch.where(events > 0, index.positives[(events - 1).clamp(min=0)], 0).long()
 
 
 def _places(chosen: Bool[Tensor, " events"]) -> Int32[Tensor, " chosen"]:
-    """Numbers of the events that are chosen."""
+    """Numbers of the chosen events."""
     places = torch.empty(int(chosen.count_nonzero()), dtype=torch.int32, device=chosen.device)
     filled = 0
     for first in range(0, len(chosen), CHUNK):
@@ -626,5 +631,5 @@ def _places(chosen: Bool[Tensor, " events"]) -> Int32[Tensor, " chosen"]:
 
 
 def _randint(high: Tensor, generator: torch.Generator) -> Tensor:
-    """Random integers in [0, high), a bound for each; biased by less than high / 2^62."""
+    """Random integers in [0, high), with a bound for each. The bias is less than high / 2^62."""
     return torch.randint(2**62, high.shape, generator=generator, device=high.device) % high

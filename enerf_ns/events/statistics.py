@@ -1,4 +1,4 @@
-"""What a recording's events tell in numbers about how to learn from them."""
+"""Statistics of a recording's events that decide how to learn from them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ BORDER = 1 / 16
 """Width of a sensor's border, as a share of its width and height."""
 
 NUM_PIXELS = 4096
-"""Pixels that are looked at, evenly over the sensor."""
+"""About the number of pixels whose brightness range is measured, evenly over the sensor."""
 
 
 def silent_share(index: EventIndex, silence_ns: int, at_most: int = 2**22) -> float:
-    """Share of the time between their first and last events that pixels are silent for at least so long.
+    """Share of long silences in the time between the first and the last event of each pixel.
 
     Args:
         index: The events.
         silence_ns: Shortest silence that counts, ns.
-        at_most: Events that are looked at, about: those of every so many pixels.
+        at_most: About the largest number of events that are used. Of more events, only some pixels count.
     """
     pixels = torch.arange(0, len(index.offsets) - 1, max(-(-len(index) // at_most), 1), device=index.times.device)
     counts = index.offsets.diff()[pixels]
@@ -34,7 +34,7 @@ def silent_share(index: EventIndex, silence_ns: int, at_most: int = 2**22) -> fl
 
 
 def border_rate(index: EventIndex, height: int) -> float:
-    """Mean events of a pixel at the sensor's border, as a share of those of a pixel elsewhere; at most 1e9.
+    """Mean number of events per pixel at the sensor's border, relative to the other pixels; at most 1e9.
 
     Args:
         index: The events.
@@ -50,18 +50,18 @@ def border_rate(index: EventIndex, height: int) -> float:
 def log_brightness_range(
     index: EventIndex, contrast_thresholds: tuple[float, float], share: float = 0.99, parts: int = 1
 ) -> float:
-    """From the darkest to the brightest that a pixel saw, as its events add up: max less min of the running sum of
-    C_on for each positive and -C_off for each negative event, and 0 before the first.
+    """Range of log brightness that single pixels saw: maximum less minimum of the sum of a pixel's events.
 
-    What a scene spans is at least this; what lies beside it, no pixel saw with it. Noise, wrong thresholds and what
-    pixels miss add to the sum as long as the recording goes on, so that halves of it span less than the whole.
+    The sum starts at 0, gains C_on with each positive event and loses C_off with each negative one. The range of the
+    scene is at least as large, since no pixel sees all of it. Noise, wrong thresholds and missing events add to the sum
+    throughout the recording, so that parts of a recording have smaller ranges than the whole.
 
     Args:
         index: With at least one event.
         contrast_thresholds: C_on and C_off, in units of log brightness.
-        share: Of the pixels with events, those that stay below what is returned.
-        parts: Equal parts of the time between the first and the last event, each with sums of its own; the largest of
-            their ranges is returned.
+        share: Share of the pixels with events whose ranges lie below the returned one.
+        parts: Number of equal parts of the time between the first and the last event, each with sums of its own. The
+            largest of their ranges is returned.
     """
     on, off = contrast_thresholds
     counts = index.offsets.diff()
@@ -74,7 +74,7 @@ def log_brightness_range(
     owner = order * parts + (index.times[events] - begin) * parts // (end - begin + 1)
 
     def sums(number: Tensor) -> Tensor:
-        """After a number of events of the index, all pixels together."""
+        """Sum over the first `number` events of the index, all pixels together."""
         positive = torch.where(number > 0, index.positives[(number - 1).clamp(min=0)], 0).double()
         return on * positive - off * (number - positive)
 

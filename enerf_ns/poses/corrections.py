@@ -1,4 +1,4 @@
-"""What is wrong with clock, mount, lens and trajectory of a recording, in numbers, and the recording without it."""
+"""Corrections of clock, mount, lens and trajectory of a recording, and the corrected recording."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ MILLISECOND = 1_000_000
 
 @dataclass(frozen=True)
 class DriftBasis:
-    """Smooth functions of time without mean: cubic B-splines between evenly spaced knots, less one of their sums."""
+    """Smooth functions of time with mean 0: combinations of cubic B-splines with evenly spaced knots."""
 
     start: int
-    """First and last time, ns; before and after, the functions stay as they are there."""
+    """First time, ns. Before it, the functions are constant."""
     end: int
+    """Last time, ns. After it, the functions are constant."""
     num_pieces: int
-    """Number of equal parts of the time between which the knots lie."""
+    """Number of equal intervals between the knots."""
 
     @property
     def size(self) -> int:
@@ -34,20 +35,20 @@ class DriftBasis:
         return self.num_pieces + 2
 
     def at(self, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times functions"]:
-        """The functions at some times, ns."""
+        """Values of the functions at some times, ns."""
         splines, without_mean = self._parts
         return splines((times - self.start).clip(0, self.end - self.start) / (self.end - self.start)) @ without_mean
 
     @cached_property
     def roughness(self) -> Float64[np.ndarray, "functions functions"]:
-        """Sum of the squared second differences of the splines' coefficients, as a quadratic form of those of the
-        functions (P-splines, Eilers and Marx, Statistical Science 1996)."""
+        """The sum of the squared second differences of the splines' coefficients, as a quadratic form of the functions'
+        coefficients (P-splines, Eilers and Marx, Statistical Science 1996)."""
         bends = np.diff(self._parts[1], n=2, axis=0)
         return bends.T @ bends
 
     @cached_property
     def _parts(self) -> tuple[BSpline, Float64[np.ndarray, "splines functions"]]:
-        """The splines, and as columns the orthonormal combinations of them that have no mean."""
+        """The splines, and the orthonormal combinations of them with mean 0, one in each column."""
         knots = np.pad(np.linspace(0.0, 1.0, self.num_pieces + 1), 3, mode="edge")
         splines = BSpline(knots, np.eye(self.num_pieces + 3), 3)
         means = (knots[4:] - knots[:-4]) / 4.0
@@ -56,11 +57,11 @@ class DriftBasis:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Shifts and rotations of a camera, in its own axes, that change with time."""
+    """Shifts and rotations of a camera in its own axes, as smooth functions of time."""
 
     basis: DriftBasis
     coefficients: Float64[np.ndarray, "functions 6"]
-    """Of shifts in metres, and of rotation vectors in radians."""
+    """Coefficients of the shifts (metres) and of the rotation vectors (radians)."""
 
     def at(self, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 6"]:
         """Shifts (metres) and rotation vectors at some times, ns."""
@@ -69,45 +70,46 @@ class Drift:
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """By what clocks, poses and lens of a recording are wrong.
+    """Errors of clocks, poses and lens of a recording.
 
-    The camera of the events has at time t the pose T(t + delay(t)) Exp(mount) Exp(drift(t)) Exp(noise(t)), where T is
-    the given trajectory; in the axes of the camera, shift and rotation apart, as `PosedCamera.rays` has corrections.
+    With the given trajectory T, the event camera has the pose T(t + delay(t)) Exp(mount) Exp(drift(t)) Exp(noise(t)) at
+    time t. Each Exp is a shift and a rotation in the axes of the camera, as in `PosedCamera.rays`.
     """
 
     delay: float = 0.0
-    """Milliseconds by which the given poses are stamped later than events of the same instant, in the middle of the
+    """Milliseconds by which the given poses are stamped later than events of the same instant, half-way through the
     poses."""
     frame_delay: float = 0.0
     """Milliseconds by which frames are stamped later than events of the same instant."""
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Rotation vector of the camera against what it is mounted on, radians."""
+    """Rotation vector of the camera against its stated mount, radians."""
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Shift of the camera against what it is mounted on, metres."""
+    """Shift of the camera against its stated mount, metres."""
     focal_scale: float = 1.0
     """The focal length as a multiple of the stated one."""
     distortion: float = 0.0
-    """What the first coefficient of radial distortion is more than stated."""
+    """True less stated first coefficient of radial distortion."""
     delay_rate: float = 0.0
-    """Milliseconds by which the delay of the poses grows in a second."""
+    """Growth of the delay of the poses, milliseconds per second."""
     drift: Drift | None = None
-    """What changes slowly. None: nothing."""
+    """Slow drift of the poses. None: no drift."""
     noise: Drift | None = None
-    """What smoothing has left of the noise of the poses. None: nothing."""
+    """Noise of the poses that smoothing left. None: no noise."""
     _made: tuple[Trajectory, Trajectory] | None = field(default=None, init=False, repr=False)
+    """A given trajectory and its correction, for the next call."""
 
     @property
     def moves_poses(self) -> bool:
-        """Whether poses of the camera of the events are others than those given."""
+        """Whether the corrections change the poses of the event camera."""
         clock = self.delay != 0.0 or self.delay_rate != 0.0
         mount = any(self.rotation) or any(self.translation)
         return clock or mount or self.drift is not None or self.noise is not None
 
     @property
     def words(self) -> list[str]:
-        """What is corrected, a few words each; empty where nothing is."""
+        """Each correction in a few words. Empty if there is none."""
         found = [f"poses stamped {self.delay:+.2f} ms late"] * bool(self.delay)
-        found += [f"their clock {self.delay_rate:+.3f} ms a second off"] * bool(self.delay_rate)
+        found += [f"clock rate of the poses {self.delay_rate:+.3f} ms per second off"] * bool(self.delay_rate)
         found += [f"frames stamped {self.frame_delay:+.2f} ms late"] * bool(self.frame_delay)
         turn, shift = (float(np.linalg.norm(part)) for part in (self.rotation, self.translation))
         found += [f"mount turned by {np.degrees(turn):.2f} degrees"] * bool(turn)
@@ -119,14 +121,14 @@ class Corrections:
 
     @property
     def changes_lens(self) -> bool:
-        """Whether the camera of the events is another one than that given."""
+        """Whether the corrections change the lens of the event camera."""
         return self.focal_scale != 1.0 or self.distortion != 0.0
 
     def camera(self, given: Camera) -> Camera:
-        """The camera of the events, of the same size.
+        """The event camera with its lens corrected.
 
         Raises:
-            ValueError: There is no such lens.
+            ValueError: The corrected lens model cannot be inverted.
         """
         if not self.changes_lens:
             return given
@@ -147,13 +149,13 @@ class Corrections:
         )
 
     def stamped(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Int64[np.ndarray, " times"]:
-        """What the clock of the given poses shows at some times (ns) of the events."""
+        """Time on the clock of the given poses at some times (ns) on the clock of the events."""
         grown = 1e-3 * self.delay_rate * (times - _middle(given))
         return times + round(MILLISECOND * self.delay) + grown.round().astype(np.int64)
 
     def _inner_times(self, given: Trajectory, own: Trajectory) -> Int64[np.ndarray, " poses"]:
-        """Times (ns) of the events at which the clock of the given poses shows those of a camera's own, within their
-        span, and the ends of that."""
+        """Times (ns) of a camera's own poses on the clock of the events, within the span of its poses, and the two ends
+        of this span."""
         middle = _middle(given)
         since = (own.times - middle - round(MILLISECOND * self.delay)) / (1.0 + 1e-3 * self.delay_rate)
         times = np.unique(middle + since.round().astype(np.int64))
@@ -161,7 +163,7 @@ class Corrections:
         return np.concatenate([[own.start], inside, [own.end]])
 
     def poses(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
-        """Poses of the camera of the events, at any times (ns): beyond the given poses it goes on at its last speed."""
+        """Poses of the event camera at any times (ns). Beyond the given poses, it moves on at its last speed."""
         poses = poses_at(given, self.stamped(given, times))
         poses = _moved(poses, np.array([self.translation]), np.array([self.rotation]))
         for drift in (self.drift, self.noise):
@@ -171,8 +173,10 @@ class Corrections:
         return poses
 
     def trajectory(self, given: Trajectory) -> Trajectory:
-        """The trajectory of the camera of the events, from the same first to the same last time; of one that is given,
-        always the same object."""
+        """The corrected trajectory of the event camera, with the same first and last time.
+
+        The same given trajectory always gives the same object.
+        """
         if not self.moves_poses:
             return given
         if self._made is None or self._made[0] is not given:
@@ -182,12 +186,12 @@ class Corrections:
         return self._made[1]
 
     def frames(self, given: Frames, recording: EventRecording) -> Frames:
-        """Frames of a recording on the clock of its events, with the poses of their camera.
+        """Corrected frames of a recording, on the clock of its events.
 
-        A camera of their own keeps its lens, and its pose against the camera of the events.
+        If frames come from another camera, it keeps its lens and its pose relative to the event camera.
 
         Args:
-            given: Within the poses.
+            given: Frames within the poses.
             recording: As it was read.
         """
         of_events, of_frames = recording.trajectory, given.trajectory
@@ -208,7 +212,7 @@ class Corrections:
         return replace(found, trajectory=_trajectory(knots, moved))
 
     def recording(self, given: EventRecording) -> EventRecording:
-        """A recording with the camera and the poses that it should have had; events and frames are the same files."""
+        """The recording with corrected camera, poses and frames. Events and frames come from the same files."""
         if not (self.moves_poses or self.changes_lens or self.frame_delay):
             return given
         frames, blurred = (
@@ -227,7 +231,7 @@ class Corrections:
 def poses_at(trajectory: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
     """Camera-to-world matrices [R | t] at any times (ns).
 
-    Before the first pose, and after the last one, the camera goes on as between the last two.
+    Before the first pose and after the last one, the camera moves on at the speed between the two nearest poses.
     """
     inside = times.clip(trajectory.start, trajectory.end)
     poses = trajectory.poses(torch.from_numpy(inside)).numpy()
@@ -247,7 +251,7 @@ def _moved(
     shifts: Float64[np.ndarray, "#poses 3"],
     turns: Float64[np.ndarray, "#poses 3"],
 ) -> Float64[np.ndarray, "poses 3 4"]:
-    """Poses of cameras that are shifted (metres), and turned (rotation vectors), in their own axes."""
+    """Poses after a shift (metres) and a turn (rotation vector) of each camera in its own axes."""
     rotation = poses[:, :, :3]
     position = poses[:, :, 3] + (rotation @ shifts[:, :, None])[..., 0]
     return np.concatenate([rotation @ Rotation.from_rotvec(turns).as_matrix(), position[..., None]], axis=-1)

@@ -1,4 +1,4 @@
-"""What was found to be wrong with clock, poses and lens of a recording, in words, with how well it is known."""
+"""Errors that a training found in clock, poses and lens of a recording, in words and with standard errors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from jaxtyping import Float64
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
 from enerf_ns.poses.corrections import Corrections, Drift
-from enerf_ns.poses.refiner import TOLD, Part, PoseRefiner
+from enerf_ns.poses.refiner import IDENTIFIABLE, Part, PoseRefiner
 
 INSTANTS, PLACES = 64, 5
-"""Instants of a recording, and columns and rows of pixels, whose points are followed from poses to others."""
+"""Number of instants, and of columns and rows of pixels, at which `picture_shift` compares two cameras."""
 
 FLAGS: dict[Part, str] = {
     "clock": "--pipeline.refine-clock",
@@ -25,30 +25,33 @@ FLAGS: dict[Part, str] = {
     "drift": "--pipeline.refine-drift",
     "noise": "--pipeline.refine-drift",
 }
+"""Flag of `ns-train` that forces or forbids the correction of each part."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One number, or some that belong together."""
+    """The error of one part of clock, poses or lens."""
 
     what: str
+    """Name of the part."""
     value: str
-    """With its unit and its standard error."""
+    """Value with its unit and its standard error."""
     is_corrected: bool
-    is_told: bool
-    """Whether the recording tells it; what it does not tell stays as it was stated."""
+    """Whether training corrected it."""
+    is_identifiable: bool
+    """Whether the recording determines the value. If not, the part stays as it was stated."""
     pixels: float
-    """By how much the correction moves the picture, root mean square over pixels and time."""
+    """Pixels by which the correction moves the picture, root mean square over pixels and time."""
     flag: str
-    """Flag of `ns-train` by which it is forced, or forbidden."""
+    """Flag of `ns-train` that forces or forbids the correction."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The fields by name, for JSON."""
         return asdict(self)
 
 
 def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
-    """What a training found, a row for each thing that may be wrong.
+    """The errors that a training found, one for each part.
 
     Args:
         refiner: At the end of the training, or while it goes on.
@@ -69,8 +72,8 @@ def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
             replace(now, delay=0.0),
         ),
         "rate": (
-            "rate of their clock",
-            f"{now.delay_rate:+.3f} ± {errors['rate'][0]:.3f} ms a second",
+            "clock rate of the poses",
+            f"{now.delay_rate:+.3f} ± {errors['rate'][0]:.3f} ms per second",
             replace(now, delay_rate=0.0),
         ),
         "rotation": (
@@ -87,16 +90,17 @@ def findings(refiner: PoseRefiner, distance: float) -> list[Finding]:
         "drift": ("drift", _size(now.drift), replace(now, drift=None)),
     }
     if "noise" in refiner.parts:
-        one_by_one["noise"] = ("noise that smoothing left", _size(now.noise), replace(now, noise=None))
+        one_by_one["noise"] = ("noise after smoothing", _size(now.noise), replace(now, noise=None))
     found = []
     for part, (what, value, without) in one_by_one.items():
-        told = part in ("drift", "noise") or bool((errors[part] < TOLD * refiner.units[part]).all())
+        known = part in ("drift", "noise") or bool((errors[part] < IDENTIFIABLE * refiner.units[part]).all())
         moved = picture_shift(recording, without, now, distance)
-        found.append(Finding(what, value, part in refiner.corrected, told, moved, FLAGS[part]))
+        found.append(Finding(what, value, part in refiner.corrected, known, moved, FLAGS[part]))
     return found
 
 
 def _size(drift: Drift | None) -> str:
+    """Root mean square of shift and turn, in words."""
     if drift is None:
         return "none"
     values = drift.at(evenly_spaced(drift.basis.start, drift.basis.end, 256))
@@ -105,11 +109,11 @@ def _size(drift: Drift | None) -> str:
 
 
 def picture_shift(recording: EventRecording, first: Corrections, second: Corrections, distance: float) -> float:
-    """By how many pixels points move in the picture from some corrections to others, root mean square.
+    """Pixels by which points move in the picture between two corrections, root mean square.
 
     Args:
         recording: As it was read.
-        first, second: The corrections.
+        first, second: The two corrections.
         distance: Depth of the points, metres.
     """
     times = recording.instants(INSTANTS)

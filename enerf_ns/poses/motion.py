@@ -1,4 +1,4 @@
-"""How far a picture moves while it is taken."""
+"""Motion of a picture during its exposure."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from jaxtyping import Float64
 from enerf_ns.dataparsers.recording.recording import Frames
 
 STEPS = 8
-"""Parts of each exposure, within which motion is taken to be straight."""
+"""Parts of each exposure. Within each part, motion counts as straight."""
 
 PLACES = 3
-"""Pixels that are followed across the picture, and down it, from border to border."""
+"""Number of pixels in a row, and in a column, of the grid that is followed."""
 
 
 def exposure_motion(frames: Frames, near: float, far: float) -> Float64[np.ndarray, " frames"]:
-    """How far what the pixels see moves during each exposure: the longest path of any that is followed, pixels.
+    """The longest path of a point in the picture during each exposure, pixels.
 
-    Points at both depths before a grid of `PLACES` x `PLACES` pixels in the middle of the exposure are followed through
-    `STEPS` parts of it.
+    The points lie at both depths along the rays of `PLACES` x `PLACES` pixels in mid-exposure.
 
     Args:
-        frames: Exposed within their trajectory.
+        frames: Their exposures lie within their trajectory.
         near, far: Range of depth, metres.
     """
     camera = frames.picture_camera
@@ -36,5 +35,5 @@ def exposure_motion(frames: Frames, near: float, far: float) -> Float64[np.ndarr
     middle = poses[:, STEPS // 2]
     points = rays @ middle[:, :, :3].transpose(0, 2, 1) + middle[:, None, :, 3]
     seen = (points[:, None] - poses[:, :, None, :, 3]) @ poses[..., :3] @ camera.matrix.T
-    places = seen[..., :2] / seen[..., 2:].clip(min=1e-3 * near)  # what is passed counts as nearly touched
+    places = seen[..., :2] / seen[..., 2:].clip(min=1e-3 * near)  # behind the camera counts as just before it
     return np.linalg.norm(np.diff(places, axis=1), axis=-1).sum(axis=1).max(axis=1)

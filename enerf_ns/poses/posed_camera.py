@@ -1,4 +1,4 @@
-"""From pixels and times to rays, in the axes and the unit of the scene."""
+"""Rays of pixels at given times, in the axes and the unit of the scene."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from enerf_ns.kernels.precision import full_precision
 
 
 class PosedCamera:
-    """A camera that moves along a trajectory. Every pixel looks from where the camera is at a time of its own.
+    """A camera that moves along a trajectory, so that each ray starts at the camera's place at its own time.
 
     Args:
         camera: With its distortion.
         trajectory: Of this camera.
         transform: [R | t] of the scene, shape (3, 4): a point p of the recording's world lies at scale * (R p + t).
-            In float64, since the world's origin may be far away.
+            It is float64, since the world's origin may be far away.
         scale: Scene units per metre.
         device: Of the rays.
     """
@@ -52,22 +52,22 @@ class PosedCamera:
         corrections: Float[Tensor, "rays 6"] | None = None,
         places: Float[Tensor, "rays 2"] | None = None,
     ) -> RayBundle:
-        """Rays through pixels, differentiable in `delays` and `corrections`.
+        """A ray bundle through pixels, differentiable with respect to `delays` and `corrections`.
 
         Args:
-            pixels: Their numbers, y * width + x.
-            times: ns, within the trajectory.
-            delays: ns that are added to the times, of any sign; with them a time can be learned. None: none.
-            corrections: Of the poses, in the axes of the camera: a shift in metres, then a rotation vector in radians;
-                with them poses can be refined. None: none.
-            places: Where in its pixel each ray goes through, x and y from the centre in pixels. None: the centre.
+            pixels: Numbers of the pixels, y * width + x.
+            times: Times (ns) within the trajectory.
+            delays: Nanoseconds that are added to the times, for delays that are learned. Default: none.
+            corrections: Corrections of the poses in the axes of the camera: a shift (metres), then a rotation vector
+                (radians). Default: none.
+            places: Position of each ray in its pixel, x and y from the pixel's centre, pixels. Default: the centre.
 
         Returns:
-            origins (rays, 3) in scene units; directions (rays, 3) of length 1; pixel_area (rays, 1); metadata
-            directions_norm (rays, 1), the length along a ray of one unit along the optical axis.
+            origins (rays, 3) in scene units, directions (rays, 3) of length 1, pixel_area (rays, 1), and in the
+            metadata directions_norm (rays, 1): the distance along a ray per unit of depth along the optical axis.
 
         Raises:
-            ValueError: A time outside the trajectory.
+            ValueError: A time lies outside the trajectory.
         """
         poses = self.trajectory.poses(times, delays)
         rotation, position = poses[..., :3], poses[..., 3]
@@ -94,11 +94,11 @@ class PosedCamera:
         )
 
     def axes(self, times: Int64[Tensor, " rays"]) -> Float[Tensor, "rays 3 3"]:
-        """Rotations from the axes of the camera at some times (ns) to those of the scene."""
+        """Rotations from the axes of the camera at some times (ns) to the axes of the scene."""
         return (self._transform[:, :3] @ self.trajectory.poses(times)[..., :3]).float()
 
     @cached_property
     def _steps(self) -> tuple[Tensor, Tensor]:
-        """`Camera.pixel_steps`, a row for each pixel, on the device."""
+        """`Camera.pixel_steps` on the device, with one row for each pixel."""
         right, down = (torch.from_numpy(step).float().view(-1, 2) for step in self.camera.pixel_steps())
         return right.to(self._norms.device), down.to(self._norms.device)

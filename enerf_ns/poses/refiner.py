@@ -1,4 +1,4 @@
-"""Clock, mount, lens and drift of the poses, found while a field is trained: by damped Gauss-Newton steps."""
+"""Estimation of errors of clock, mount, lens and poses while a field is trained, by damped Gauss-Newton steps."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis
 
 Part = str
-"""Something that may be wrong: clock, rate (of the clock), rotation (of the mount), translation (of it), lens, drift,
-or noise (that smoothing left)."""
+"""Name of a part of clock, poses or lens that may be wrong: clock, rate (of the clock), rotation and translation (of
+the mount), lens, drift, or noise (after smoothing)."""
 
 UNITS: dict[Part, float] = {
     "clock": 20.0,
@@ -37,146 +37,150 @@ UNITS: dict[Part, float] = {
     "drift": 1.0,
     "noise": 1.0,
 }
-"""How large each number may be expected to be: its unit here, and the standard deviation of what is known of it
-beforehand. Milliseconds, milliseconds a second, radians, metres, shares."""
+"""Prior standard deviation of each number, which is its unit here: milliseconds, milliseconds per second, radians,
+metres, and a share of the focal length. Drift and noise have units of their own: `DRIFT_UNITS`, and the noise that
+smoothing took off."""
 
 STARTS_WITHIN: dict[Part, float] = {"clock": 1.0, "lens": 0.03}
-"""Milliseconds, and share of the focal length, within which what it starts from is right: standard deviation."""
+"""Standard deviation of the error of a start value: milliseconds, and a share of the focal length."""
 
 DISTORTION_UNITS = 0.02, 0.2
 """Smallest and largest unit of the first coefficient of distortion."""
 
 DRIFT_UNITS = np.array([0.01] * 3 + [math.radians(0.5)] * 3)
-"""The same of the coefficients of the drift."""
+"""Prior standard deviations of the coefficients of the drift: metres and radians."""
 
 PIECE_SECONDS, FEWEST_PIECES, MOST_PIECES = 0.2, 6, 60
 """Length (s) of the pieces of a drift, and their fewest and most number."""
 
 NOISE_POSES, MOST_NOISE_PIECES = 2, 160
-"""Intervals between poses in a piece of the noise, and most pieces of it."""
+"""Number of intervals between poses in a piece of the noise, and most pieces."""
 
 NOISE_LEFT = 0.6
-"""What is expected of the noise after smoothing, of what was taken off: standard deviations."""
+"""Expected standard deviation of the noise after smoothing, as a share of the noise that smoothing took off."""
 
 FIRST_STEP = 50
-"""Steps before which a field shows too little."""
+"""First step at which pairs are compared. Before it, the field shows too little."""
 
 FROZEN_FROM = 0.8
-"""Share of the steps after which corrections stay as they are."""
+"""Share of the steps after which corrections no longer change."""
 
 BEGINS_UNTIL = 0.4
-"""Share of the steps after which nothing is corrected that was not before, since the field has to follow."""
+"""Share of the steps after which no further part is corrected, since the field has to follow corrections."""
 
 LOOK_EVERY, LOOK_AGAIN_EVERY, LOOKS_A_SOLUTION = 4, 2, 6
-"""Steps from which pairs are looked at to the next, the same at first where something is being corrected, and how often
-that is done before what was seen is solved."""
+"""Steps from one look at pairs to the next, the same at first while a part is being corrected, and looks per
+solution."""
 
 PAIRS = 256
-"""Most pairs that are looked at at once."""
+"""Most pairs of one look."""
 
 MEMORY = 0.9
-"""Share of what was seen before that counts after poses were corrected."""
+"""Weight of earlier looks after each correction of the poses."""
 
 SURE, STAYS = 9.0, 3.0
-"""By how much the squared error, in units of its variance, must fall beyond what chance explains before something is
-corrected, and for it to stay so."""
+"""Decrease of the squared error, in units of its variance and beyond chance, that begins the correction of a part, and
+that keeps it."""
 
 SYSTEMATIC = 0.01
-"""Pixels by which what is rendered may be off as a whole in any one way, however much was seen: standard deviation."""
+"""Standard deviation (pixels) of an error of the whole rendered picture in any one direction, which more looks do not
+reduce."""
 
 SETTLED_AFTER = 200.0
-"""Steps before which it may be off by more, the more the fewer they are."""
+"""Step before which that error is larger, in inverse proportion to the step."""
 
 SMALLEST_TURN = math.radians(2.0)
-"""Root mean square angle by which a camera must turn about a second axis for its mount and its lens to be corrected
-without being asked for."""
+"""Smallest root mean square turn of the camera about its second axis (radians) with which mount and lens are corrected
+by default."""
 
-TOLD = 0.25
-"""Largest standard error of numbers that are said to be told, in their units."""
+IDENTIFIABLE = 0.25
+"""Largest standard error of an identifiable number, in its unit."""
 
 LARGEST_STEP = 0.5
-"""Most that any number changes at once, in its unit."""
+"""Largest change of a number in one solution, in its unit."""
 
 LIMITS: dict[Part, tuple[float, str]] = {
     "clock": (5.0, "the clock of the poses would have to be corrected by more than 100 ms"),
-    "rate": (100.0, "the clock of the poses would have to be corrected by more than 10 ms a second"),
+    "rate": (100.0, "the clock of the poses would have to be corrected by more than 10 ms per second"),
     "rotation": (10.0, "the mount would have to be turned by more than 10 degrees"),
     "translation": (20.0, "the mount would have to be shifted by more than 200 mm"),
     "lens": (8.0, "the focal length would have to be corrected by more than 24 %"),
     "drift": (20.0, "the poses would have to drift by more than 200 mm or 10 degrees"),
     "noise": (20.0, "the noise of the poses would have to be more than 12 times what was taken off"),
 }
-"""Largest corrections, in their units, that are believed, and what is said of larger ones."""
+"""Largest plausible corrections, in their units, and the clause of the error message about a larger one."""
 
 MIDDLE_GREY = 0.3
-"""Brightness of what is not stopped by surfaces."""
+"""Brightness behind the scene, where accumulation is below 1."""
 
 POWERS = [(i, j, k) for i in range(3) for j in range(3) for k in range(3) if i + j + k <= 2]
 NUM_SHAPES = len(POWERS)
-"""Number of polynomials of the place, up to squares, along each axis, by which the scene may bend."""
+"""Number of polynomials of the position, up to squares, by which the scene may bend along each axis."""
 
 NUM_OTHERS = 5
-"""Number of columns of what else may be wrong: the photoreceptor's lag, the refractory period, contrast, the ratio of
-the thresholds, a leak."""
+"""Number of nuisance columns: the photoreceptor's lag, the refractory period, contrast, the ratio of the thresholds,
+and a leak."""
 
 BEND = 0.1
-"""How far the scene may be expected to bend, scene units."""
+"""Prior standard deviation of a bend of the scene, scene units."""
 
 
 @dataclass
 class RefinerConfig:
-    """What of clock, poses and lens is corrected while training. What is None is chosen from the recording."""
+    """Which errors of clock, poses and lens are corrected while training. None: the recording decides."""
 
     clock_ms: Optional[float] = None  # noqa: UP045
-    """Milliseconds by which poses are stamped later than events of the same instant. None: what the contrast of the
-    events tells, refined while training; a value is kept."""
+    """Milliseconds by which poses are stamped later than events of the same instant. A value stays fixed. Default:
+    motion compensation of the events estimates it before training, and training refines it."""
     frame_delay_ms: Optional[float] = None  # noqa: UP045
-    """Milliseconds by which frames are stamped later than events of the same instant. None: where poses are, what edges
-    in frames tell before training; else 0."""
+    """Milliseconds by which frames are stamped later than events of the same instant. Default: the delay that edges in
+    frames and events show before training, if the clock of the poses is estimated, too; else 0."""
     focal_scale: Optional[float] = None  # noqa: UP045
-    """The focal length as a multiple of the stated one. None: what the contrast of the events tells, refined while
-    training; a value is kept."""
+    """The focal length as a multiple of the stated one. A value stays fixed. Default: motion compensation of the events
+    estimates it before training, and training refines it."""
     refine_clock: Optional[bool] = None  # noqa: UP045
-    """Correct the clock between poses and events. None: where the events show that it is wrong."""
+    """Correct the clock between poses and events. Default: if the events show that it is wrong."""
     refine_mount: Optional[bool] = None  # noqa: UP045
-    """Correct how the camera is mounted on what the poses are of. None: where the events show that it is wrong."""
+    """Correct the pose of the camera on the body that the poses belong to. Default: if the events show that it is
+    wrong."""
     refine_lens: Optional[bool] = None  # noqa: UP045
-    """Correct the focal length and the first coefficient of distortion. None: where the events show that they are
+    """Correct the focal length and the first coefficient of distortion. Default: if the events show that they are
     wrong."""
     refine_drift: Optional[bool] = None  # noqa: UP045
-    """Correct a smooth drift of the poses, and what noise smoothing has left. None: where the events show that there is
-    a drift; noise where poses were smoothed."""
+    """Correct a smooth drift of the poses, and the noise that smoothing left. Default: drift if the events show one,
+    noise if the poses were smoothed."""
 
 
 class PoseRefiner(nn.Module):
-    """What is wrong with the poses, as far as the events have told. Its buffers are stored with the run.
+    """Estimates errors of clock, poses and lens from events. Its buffers are stored with the run.
 
-    Each look compares pairs of events with what is rendered of them, and asks by how much the difference would change
-    with each number: the slope of rendered brightness along each ray's place and direction, of one backward pass, times
-    how place and direction change with it. From time to time what was seen is solved for the numbers (Gauss-Newton,
-    with Huber's weights, and what is known beforehand as damping).
+    Each look compares pairs of events with their rendered changes of brightness. The derivative of the difference with
+    respect to each number follows from one backward pass: it is the slope of rendered brightness along each ray's
+    origin and direction, times their derivative with respect to the number. After some looks, a Gauss-Newton step with
+    Huber's weights solves for the numbers, and their priors damp it.
 
-    A field that learns from wrong poses hides their error in itself: the scene is bent so that it fits them. So the
-    scene may bend in the solution, too, by polynomials of the place; what is left of an error after that is what it
-    shows in spite of the field. Without this, a focal length that was wrong by 3 % was corrected by 0.4 % after 600
-    steps; with it, by 2.7 %.
+    A field that learns from wrong poses hides their error, because it bends the scene until the scene fits the poses.
+    So the solution lets the scene bend, too, by polynomials of the position. Only the rest of the error moves a number.
+    Without the bend, a focal length that was wrong by 3 % was corrected by 0.4 % after 600 steps; with it, by 2.7 %.
 
-    A part is corrected only where the squared error falls by more than chance explains; until then it costs nothing but
+    A part is corrected only if that reduces the squared error by more than chance explains. Until then, it costs only
     the looks.
 
     Args:
-        config: Without anything open but what the events decide.
+        config: With all values that the events do not decide.
         recording: As it was read.
     """
 
     value: Tensor
     """The numbers, in their units."""
     is_corrected: Tensor
-    """Of each part."""
+    """Whether each part is corrected."""
     normal: Tensor
-    """Equations of the numbers and of what is solved for beside them."""
+    """Matrix of the normal equations of the numbers, the bends of the scene and the nuisance columns."""
     right: Tensor
+    """Right side of the normal equations."""
     looks: Tensor
+    """Number of looks so far."""
 
     def __init__(self, config: RefinerConfig, recording: EventRecording):
         super().__init__()
@@ -194,7 +198,7 @@ class PoseRefiner(nn.Module):
             wanted_pieces = (trajectory.end - trajectory.start) / (NOISE_POSES * np.median(np.diff(trajectory.times)))
             pieces = int(np.clip(round(wanted_pieces), 1, MOST_NOISE_PIECES))
             self.noise_basis = DriftBasis(trajectory.start, trajectory.end, pieces)
-            # white noise, of which a piece that is longer than wanted averages the more
+            # white noise: a piece that is longer than wanted averages more of it
             left = NOISE_LEFT * math.sqrt(min(pieces / wanted_pieces, 1.0)) * np.repeat(taken_off, 3)
             noise_units = np.tile(left, self.noise_basis.size)
             sizes["noise"] = len(noise_units)
@@ -245,19 +249,9 @@ class PoseRefiner(nn.Module):
                 self._before[number, number] = (unit / STARTS_WITHIN[part]) ** 2
                 self.is_corrected[list(self.parts).index(part)] = True
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Of runs from before the rate of the clock, the second number, and noise were told, too."""
-        if len(state_dict.get(f"{prefix}value", self.value)) < len(self.value):
-            for name in ("value", "is_corrected"):
-                found, known = torch.zeros_like(getattr(self, name)), state_dict[prefix + name]
-                found[0], found[2 : 1 + len(known)] = known[0], known[1:]
-                state_dict[prefix + name] = found
-            state_dict[f"{prefix}normal"], state_dict[f"{prefix}right"] = self.normal, self.right
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
     @property
     def units(self) -> dict[Part, Float64[np.ndarray, " numbers"]]:
-        """How large each number may be expected to be, as in `UNITS`."""
+        """Prior standard deviation of each number: milliseconds, milliseconds per second, radians, metres, shares."""
         return {part: self._units[where] for part, where in self.parts.items()}
 
     @property
@@ -267,7 +261,7 @@ class PoseRefiner(nn.Module):
 
     @property
     def corrections(self) -> Corrections:
-        """As they are."""
+        """The present corrections."""
         numbers = {part: (self.value.numpy() * self._units)[where] for part, where in self.parts.items()}
         drift = noise = None
         if "drift" in self.corrected:
@@ -295,17 +289,16 @@ class PoseRefiner(nn.Module):
         others: Float64[np.ndarray, "pairs others"],
         lags: Float64[np.ndarray, "2 pairs lags"],
     ) -> None:
-        """Takes in some pairs.
+        """Adds some pairs of events to the normal equations.
 
         Args:
-            residual: Measured changes of log brightness less rendered ones, thresholds.
-            slopes: Of the rendered log brightness, thresholds, of all first instants and then of all second ones.
-            times: Of both instants, ns.
-            pixels: Their numbers, y * width + x.
-            others: By how much the change of log brightness, thresholds, changes with what else may be wrong, each
+            residual: Measured less rendered changes of log brightness, in thresholds.
+            slopes: Slopes of the rendered log brightness, in thresholds: all first instants, then all second ones.
+            times: Both instants, ns.
+            pixels: Numbers of the pixels, y * width + x.
+            others: Derivatives of the change of log brightness, in thresholds, with respect to nuisance parameters of
                 about 1.
-            lags: By how much of a millisecond pixels see late, of each of what may be wrong with their lag, at both
-                instants.
+            lags: Derivatives of the pixels' lag (ms) at both instants, with respect to nuisance parameters of the lag.
         """
         times = times.reshape(-1)
         twists = np.concatenate([slopes.shifts, slopes.turns], axis=1)
@@ -329,7 +322,7 @@ class PoseRefiner(nn.Module):
         times: Int64[np.ndarray, " rays"],
         pixels: Int64[np.ndarray, " rays"],
     ) -> dict[Part, Float64[np.ndarray, "rays numbers"]]:
-        """By how much the log brightness of rays changes with each number."""
+        """Derivatives of the log brightness of rays with respect to each number."""
         now = self.corrections
         early, late = (now.poses(self.recording.trajectory, times + step) for step in (-500_000, 500_000))
         back = early[:, :, :3].transpose(0, 2, 1)
@@ -353,7 +346,7 @@ class PoseRefiner(nn.Module):
         return columns
 
     def _lens_slopes(self) -> list[Float64[np.ndarray, "pixels 3"]]:
-        """By how much the directions of pixels change with each number of the lens."""
+        """Derivatives of the directions of pixels with respect to each number of the lens."""
         now, step = self.corrections, 1e-3
         key = now.focal_scale, now.distortion
         if self._lens is None or self._lens[0] != key:
@@ -370,17 +363,17 @@ class PoseRefiner(nn.Module):
         return self._lens[1]
 
     def solve(self, step: int, may_begin: bool = True) -> bool:
-        """Corrects what was seen to be wrong.
+        """Solves the normal equations, and updates the corrections.
 
         Args:
-            step: Of the training.
-            may_begin: Correct parts, too, that are not corrected yet.
+            step: Step of the training.
+            may_begin: Whether the correction of further parts may begin.
 
         Returns:
-            Whether anything changed.
+            Whether a correction changed.
 
         Raises:
-            RecordingError: Something is wrong by more than can be.
+            RecordingError: A correction exceeds `LIMITS`.
         """
         systematic = SYSTEMATIC * max(1.0, SETTLED_AFTER / step)
         believed = 1.0 / (1.0 + systematic**2 * self._information_a_pixel)
@@ -399,7 +392,7 @@ class PoseRefiner(nn.Module):
                 self.is_corrected[number] = part in parts
         free = self._numbers(parts)
         damped = normal[np.ix_(free, free)] + self._before[np.ix_(free, free)]
-        change = -value  # of what is no longer corrected, all at once
+        change = -value  # a part that is no longer corrected goes back to 0 at once
         change[free] = np.linalg.solve(damped, absolute[free]) - value[free]
         for part in self._always:
             change[self.parts[part]] = 0.0
@@ -414,9 +407,9 @@ class PoseRefiner(nn.Module):
         return True
 
     def _change_of_noise(self, change: Float64[np.ndarray, " whole"]) -> Float64[np.ndarray, " numbers"]:
-        """What the noise changes by once all else has changed.
+        """The change of the noise after all other numbers have changed.
 
-        What is rendered may be off by as much in each piece as it may be as a whole.
+        The rendered picture may have the error `SYSTEMATIC` in each piece of the noise.
         """
         assert self.noise_basis is not None
         noise, normal = self.parts["noise"], self.normal.numpy()
@@ -425,8 +418,8 @@ class PoseRefiner(nn.Module):
         return np.linalg.solve(believed * normal[noise, noise] + np.eye(len(pull)), pull)
 
     def errors_of(self, part: Part) -> Float64[np.ndarray, " numbers"]:
-        """Standard errors of the numbers of a part, in the units of `UNITS`, whether it is corrected
-        or not; those of the drift are of its coefficients."""
+        """Standard errors of the numbers of a part, corrected or not: milliseconds, milliseconds per second, radians,
+        metres, shares. For the drift, they are those of its coefficients."""
         believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_pixel)
         parts = [other for other in self.parts if other == part or (other in self.corrected and other != "noise")]
         numbers = self._numbers(parts)
@@ -436,24 +429,25 @@ class PoseRefiner(nn.Module):
         return (np.sqrt(variances[: self.number]) * self._units)[self.parts[part]]
 
     def _numbers(self, parts: Sequence[Part]) -> Int64[np.ndarray, " free"]:
-        """Places of the numbers of some parts in a solution, and of all that is solved for beside them."""
+        """Indices of the numbers of some parts in a solution, and of all bends and nuisance columns."""
         whole = np.arange(len(self.right))
         chosen = [*parts, *(part for part in self._always if part not in parts)]
         return np.concatenate([*(whole[self.parts[part]] for part in chosen), whole[self.number :]])
 
     @property
     def _always(self) -> list[Part]:
-        """Parts that are corrected without a test."""
+        """Parts that are corrected without a test for significance."""
         return [part for part in self.parts if part == "noise"]
 
     def _chance(self, part: Part) -> float:
-        """What numbers that are all nothing hardly ever explain of the squared error, in units of its variance."""
+        """Decrease of the squared error, in units of its variance, that numbers whose true value is 0 hardly ever
+        reach."""
         size = self.parts[part].stop - self.parts[part].start
         return size + 3.0 * math.sqrt(2.0 * size) + (STAYS if part in self.corrected else SURE)
 
     @cached_property
     def _subsets(self) -> list[tuple[Part, ...]]:
-        """All sets of parts other than the drift that may be corrected."""
+        """All sets of parts that may be corrected, without the drift."""
         free = [part for part in self.allowed if part not in self.wanted and part != "drift"]
         chosen = [some for count in range(len(free) + 1) for some in combinations(free, count)]
         wanted = [part for part in self.wanted if part != "drift"]
@@ -462,10 +456,10 @@ class PoseRefiner(nn.Module):
     def _best_parts(
         self, normal: Float64[np.ndarray, "whole whole"], right: Float64[np.ndarray, " whole"]
     ) -> tuple[Part, ...]:
-        """Of all sets of parts that may be corrected, the one that explains most of the squared error beyond chance.
+        """The set of parts whose correction reduces the squared error most, beyond chance.
 
         Args:
-            normal, right: Of the equations for all numbers, not for their changes.
+            normal, right: Normal equations for all numbers, not for their changes.
         """
         damped = normal + self._before
         small, drift = self.parts["drift"].start, "drift" in self.allowed
@@ -488,14 +482,14 @@ class PoseRefiner(nn.Module):
                 worth -= sum(self._chance(part) for part in others if part not in self.wanted)
                 errors = np.zeros(small)
                 errors[numbers] = np.sqrt(covariance.diagonal())
-                told = all(errors[self.parts[part]].max() < TOLD for part in others if part not in self.wanted)
-                if told and worth > most:
+                known = all(errors[self.parts[part]].max() < IDENTIFIABLE for part in others if part not in self.wanted)
+                if known and worth > most:
                     best, most = (*others, *(("drift",) if with_drift else ())), worth
         return best
 
     @property
     def _information_a_pixel(self) -> float:
-        """By how much the squared error, in units of its variance, rises when all that is rendered moves by a pixel."""
+        """Increase of the squared error, in units of its variance, when the whole rendered picture moves by a pixel."""
         sideways = self.normal.diagonal()[self.parts["rotation"]][:2].mean()
         return float(sideways) / (UNITS["rotation"] * self.recording.camera.fx) ** 2
 
@@ -504,9 +498,9 @@ class PoseRefiner(nn.Module):
             most, what = LIMITS[part]
             if not bool((self.value[where].abs() <= most).all()):
                 raise RecordingError(
-                    f"{self.recording.path}: to fit the events, {what}, which is not believed; check poses and "
-                    "calibration with enerf inspect, or train with them as they are (--pipeline.refine-clock False, "
-                    "and so on)."
+                    f"{self.recording.path}: to fit the events, {what}, which is not plausible; check poses and "
+                    "calibration with enerf inspect, or train with them as stated (--pipeline.refine-clock False, and "
+                    "so on)."
                 )
 
 
@@ -517,10 +511,11 @@ def _distortion_unit(camera: Camera) -> float:
 
 
 def turns_about_two_axes(trajectory: Trajectory) -> bool:
-    """Whether a camera turns far enough for its lens, and how it is mounted, to be told from the scene.
+    """Whether a camera turns far enough for its lens and its mount to be identifiable.
 
-    About one axis alone, a direction of the mount's shift stays open (Tsai and Lenz, IEEE Transactions on Robotics and
-    Automation 1989); without turns, all of the mount and the focal length are as good as another scene.
+    If it turns about one axis alone, one direction of the mount's shift is not identifiable (Tsai and Lenz, IEEE
+    Transactions on Robotics and Automation 1989). If it does not turn, neither mount nor focal length are: another
+    scene explains the same events.
     """
     rotations = Rotation.from_quat(trajectory.quaternions)
     turns = (rotations.mean().inv() * rotations).as_rotvec()
@@ -530,20 +525,20 @@ def turns_about_two_axes(trajectory: Trajectory) -> bool:
 
 @dataclass(frozen=True)
 class Slopes:
-    """By how much rendered log brightness changes with a ray, in the axes of the camera."""
+    """Derivatives of the rendered log brightness of rays, in the axes of the camera."""
 
     shifts: Float64[np.ndarray, "rays 3"]
-    """With its origin, a metre."""
+    """With respect to the origin of the ray, per metre."""
     turns: Float64[np.ndarray, "rays 3"]
-    """With the camera's rotation vector, a radian."""
+    """With respect to the rotation vector of the camera, per radian."""
     directions: Float64[np.ndarray, "rays 3"]
-    """With its direction of length 1."""
+    """With respect to the direction of the ray, which has length 1."""
     bends: Float64[np.ndarray, "rays shapes"]
-    """With each of the shapes by which the scene may bend."""
+    """With respect to each polynomial by which the scene may bend."""
 
 
 class SampledModel(Protocol):
-    """A model whose field is rendered at samples along rays."""
+    """A model that renders its field at samples along rays."""
 
     collider: Any
     gain: float
@@ -561,19 +556,19 @@ def render_slopes(
     axes: Float[Tensor, "rays 3 3"],
     scale: float,
 ) -> tuple[Tensor, Slopes]:
-    """What rays show, and its slopes.
+    """Renders rays, and differentiates what a pixel sees with respect to origin and direction of each ray.
 
-    Samples stay at their places along the rays. The field's parameters get no gradients.
+    Samples keep their distances along the rays. The field's parameters get no gradients.
 
     Args:
-        model: That renders.
-        rays: One after the other.
-        seen: Makes log brightness (rays,) of rendered brightness (rays, channels).
-        axes: Rotations from the axes of the camera to those of the scene.
+        model: Renders the rays.
+        rays: A flat bundle.
+        seen: Function from rendered brightness (rays, channels) to log brightness (rays,).
+        axes: Rotations from the axes of the camera to the axes of the scene.
         scale: Scene units per metre.
 
     Returns:
-        Brightness (rays, channels), and the slopes of what `seen` makes of it.
+        Brightness (rays, channels), and the slopes of the log brightness.
     """
     if rays.nears is None:
         rays = model.collider(rays)

@@ -381,13 +381,13 @@ def _poses_table(one: _Reported, of_several: bool) -> Table:
         [
             row["what"],
             "corrected" if row["is_corrected"] else "as stated",
-            row["value"] if row["is_told"] else f"not told ({row['value']})",
+            row["value"] if row["is_identifiable"] else f"not identifiable ({row['value']})",
             f"{row['pixels']:.2g} pixels" if row["is_corrected"] else NONE,
             row["flag"],
         ]
         for row in one.poses
     ]
-    note = "With standard errors. What events do not tell, or what is told to be nothing, stays as it was stated."
+    note = "With standard errors. A part that is not identifiable, or not significantly wrong, stays as it was stated."
     if one.at_stated_poses:
         scores = ", ".join(f"{SCORES[name]} {score_cell(name, value)}" for name, value in one.at_stated_poses.items())
         note += (

@@ -1,4 +1,4 @@
-"""How much one kind of measurement counts beside another."""
+"""Automatic weight of one loss relative to another."""
 
 from __future__ import annotations
 
@@ -8,41 +8,42 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce, get_world_size, is_initialized
 
 MEMORY = 0.99
-"""Share of the mean error that one step leaves of that before it."""
+"""Weight of the earlier mean error in the running mean of each step."""
 
 
 class ErrorBalance(nn.Module):
-    """Weight of a second loss beside a first one, so that each counts as its own error says: that of frames beside that
-    of events, or that of pairs of any instants beside that of pairs of events.
+    """Weight of a second loss relative to a first one, from the errors of both.
 
-    Where the errors of two kinds of measurement are independent, with variances that nobody knows, the likelihood of
-    both, with those that make it largest, is the product of each mean squared error to the power of minus half their
-    number. Its logarithm has the gradient of the sum of both losses, each weighted by its number over its mean (as the
-    learned variances of Kendall, Gal, Cipolla, CVPR 2018, of which these are the optimum). The means are followed as
-    they fall during training.
+    It weights the loss of frames relative to the loss of events, or the loss of pairs of any instants relative to the
+    loss of pairs of events.
+
+    Let two kinds of measurement have n_1 and n_2 independent errors of unknown variances. The likelihood, maximised
+    over both variances, is MSE_1^(-n_1/2) * MSE_2^(-n_2/2). The gradient of its negative logarithm is the gradient of
+    the sum of both losses with the weights n / MSE. These variances are the optimum of the learned ones of Kendall, Gal
+    and Cipolla, CVPR 2018. Running means follow both errors as they fall during training.
     """
 
     errors: Tensor
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("errors", torch.zeros(3))  # of the first, of the second, and what their weights add up to
+        self.register_buffer("errors", torch.zeros(3))  # first, second, and the sum of the weights of the running means
 
     def forward(
         self, first: Float[Tensor, ""], num_first: int, second: Float[Tensor, ""], num_second: int
     ) -> Float[Tensor, ""]:
-        """Weight of the second loss beside a first one of weight 1, without a gradient.
+        """Weight of the second loss for a weight 1 of the first one, without a gradient.
 
         Args:
-            first: Mean error of the first kind in this step, about squared: a loss without its weight.
-            num_first: Number of its measurements.
-            second: The same of the second kind.
-            num_second: Number of its measurements.
+            first: Mean (about squared) error of the first kind in this step: a loss without its weight.
+            num_first: Number of measurements of the first kind.
+            second: Mean error of the second kind.
+            num_second: Number of measurements of the second kind.
         """
         seen = torch.stack([first.detach(), second.detach(), torch.ones_like(first)]).to(self.errors)
         if self.training:
             if is_initialized():
-                all_reduce(seen)  # of as many of each kind in each process; only one of them evaluates
+                all_reduce(seen)  # all processes have as many measurements; only one process evaluates
                 seen = seen / get_world_size()
             self.errors += (1.0 - MEMORY) * (torch.where(seen.isfinite().all(), seen, self.errors) - self.errors)
         means = torch.where(self.errors[2] > 0.0, self.errors, seen)

@@ -1,4 +1,4 @@
-"""What a rendered field is told by events, whatever rendered it."""
+"""Losses and metrics of rendered brightness against events, for any renderer."""
 
 from __future__ import annotations
 
@@ -21,28 +21,29 @@ from enerf_ns.supervision.losses import (
 )
 
 EventLoss = Callable[[Tensor, Tensor, "float | Tensor"], Tensor]
-"""Loss of events: a function of rendered changes of log brightness (pairs,), measured ones (pairs,) and the mean
-contrast threshold that gives one number."""
+"""Loss of events: a function of the rendered changes of log brightness (pairs,), the measured changes (pairs,) and the
+mean contrast threshold. It returns one number."""
 
 EVENT_LOSSES: dict[str, EventLoss] = {
     "huber": huber_event_loss,
     "squared": squared_event_loss,
     "normalised": lambda predicted, measured, _: normalised_event_loss(predicted, measured),
 }
-"""Losses by the names that the flag event-loss takes; a loss of one's own is put in here."""
+"""Losses by the values of the flag event-loss. Add your own loss here."""
 
 
 @dataclass(frozen=True)
 class EventSupervision:
-    """Losses and metrics of the pairs of a batch; of a field, splats, or anything else that renders brightness."""
+    """Losses and metrics of the pairs of a batch, for a field, splats, or any other renderer of brightness."""
 
     event_loss: str
     """Name of the loss of events, one of `EVENT_LOSSES`."""
     event_loss_weight: float
+    """Weight of the loss of events."""
     no_event_loss_weight: float
     """Weight of the loss on silent pixels."""
     no_event_margin: float
-    """Share of the threshold that a silent pixel may change at no cost."""
+    """Change of a silent pixel that costs nothing, as a share of the threshold."""
 
     def losses(
         self,
@@ -51,14 +52,16 @@ class EventSupervision:
         batch: EventBatch,
         sensor: SensorModel,
     ) -> dict[str, Tensor]:
-        """event_loss, where the batch has pairs of events, instant_loss, where it has pairs of any instants, and
-        no_event_loss, where it has silent pixels; with their weights.
+        """The weighted losses of a batch, by name.
+
+        These are event_loss for pairs of events, instant_loss for pairs of any instants, and no_event_loss for silent
+        pixels, each if the batch has such pairs.
 
         Args:
             start: Brightness rendered at the first instants.
             end: Brightness rendered at the second instants.
-            batch: What was measured.
-            sensor: What measured it.
+            batch: The pairs.
+            sensor: The sensor that fired the events.
         """
         change = brightness_change(start, end, batch, sensor)
         silent = batch.silent
@@ -83,11 +86,11 @@ class EventSupervision:
         batch: EventBatch,
         sensor: SensorModel,
     ) -> dict[str, Tensor]:
-        """event_correlation: the linear correlation of rendered and measured changes; arguments as of `losses`."""
+        """event_correlation: the linear correlation of rendered and measured changes. Arguments as in `losses`."""
         fired = batch.fired
         change = brightness_change(start, end, batch, sensor)[fired]
         measured = sensor.measured_change(batch)[fired]
-        # of what is centred, the cosine; torch.corrcoef would have a GPU waited for
+        # the cosine of centred values; torch.corrcoef would wait for a GPU
         change, measured = change - change.mean(), measured - measured.mean()
         return {"event_correlation": cosine_similarity(change, measured, dim=0)}
 
@@ -99,6 +102,7 @@ def brightness_change(
     batch: EventBatch,
     sensor: SensorModel,
 ) -> Float[Tensor, " pairs"]:
-    """Change of log brightness, as the pixels of a batch see what was rendered at their two instants."""
+    """Rendered change of log brightness of each pair, as its pixel sees it. Arguments as in
+    `EventSupervision.losses`."""
     change = sensor.log_brightness(end, batch.pixels) - sensor.log_brightness(start, batch.pixels)
     return change - sensor.lag(start, end, batch) if sensor.lags and batch.rates is not None else change

@@ -1,4 +1,4 @@
-"""What changes from frame to frame though the scene does not: auto-exposure."""
+"""Auto-exposure: a learned gain and offset for each frame."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from torch import Tensor, nn
 
 
 class FrameExposure(nn.Module):
-    """A gain and an offset for each frame, by which a camera made its picture of what the field shows; in the mean over
-    all frames they are 1 and 0, so that the field keeps the level of the frames.
+    """A learned gain and offset from rendered brightness to each frame.
 
-    Learned as the appearance of each picture is in other radiance fields (Martin-Brualla et al., NeRF in the Wild, CVPR
-    2021), with two numbers in place of a network.
+    The geometric mean of all gains is 1, and the mean of all offsets is 0, so that the field keeps the level of the
+    frames. NeRF in the Wild (Martin-Brualla et al., CVPR 2021) learns the appearance of each picture in a similar way,
+    with a network in place of two numbers.
 
     Args:
-        num_frames: That are learnt from.
+        num_frames: Number of frames to learn from.
     """
 
     times: Tensor
+    """Times of the frames, ns."""
 
     def __init__(self, num_frames: int):
         super().__init__()
@@ -30,10 +31,10 @@ class FrameExposure(nn.Module):
     def forward(
         self, rendered: Float[Tensor, "pixels channels"], frames: Int64[Tensor, " pixels"]
     ) -> Float[Tensor, "pixels channels"]:
-        """What the camera made of rendered brightness.
+        """Brightness in the frames.
 
         Args:
-            rendered: Linear brightness.
+            rendered: Rendered linear brightness.
             frames: Number of the frame of each pixel.
         """
         gain, offset = self._of_frames()
@@ -41,8 +42,11 @@ class FrameExposure(nn.Module):
 
     @torch.no_grad()
     def at(self, time: int) -> tuple[float, float]:
-        """Gain and offset of a frame at another instant (ns), in a straight line between those of its neighbours; of a
-        frame before or after all, those of the first or last."""
+        """Gain and offset at any instant (ns).
+
+        The logarithm of the gain, and the offset, are interpolated linearly between frames. Before the first and after
+        the last frame, they are constant.
+        """
         order = self.times.argsort()
         gain, offset = (values[order].double().cpu().numpy() for values in self._of_frames())
         times = self.times[order].double().cpu().numpy()

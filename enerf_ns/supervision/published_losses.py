@@ -1,4 +1,4 @@
-"""Losses of other methods on the field of enerf: how pairs are drawn, what pixels compare, and what an error costs."""
+"""Losses of publications on the field of enerf, as settings: pairs, brightness response, and loss functions."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 @dataclass(frozen=True)
 class PublishedLosses:
-    """What a publication has a field learn from events, as settings of the method enerf."""
+    """The event losses of a publication, as settings of the method enerf."""
 
     source: str
     """Name of the method, authors, venue and year."""
     settings: dict[str, Any]
-    """Values by the names of ns-train's flags."""
+    """Values by the names of the flags of `ns-train`."""
 
 
 PAIRS = 1365
-"""Pairs of instants that enerf draws at each step, of events and silent pixels; each of these draws as many in all."""
+"""Pairs of instants per step, events and silent pixels together: as many as enerf draws."""
 
 PUBLISHED_LOSSES: dict[str, PublishedLosses] = {
     "enerf-paper-loss": PublishedLosses(
@@ -30,7 +30,7 @@ PUBLISHED_LOSSES: dict[str, PublishedLosses] = {
             "pipeline.model.sensor.response": "linlog",
             "pipeline.model.sensor.refractory_period_ns": 0,
             "pipeline.model.event_loss": "squared",
-            "pipeline.model.no_event_loss_weight": 5.0,  # as enerf-paper has it, for runs with silent pairs
+            "pipeline.model.no_event_loss_weight": 5.0,  # the weight in enerf-paper, for runs with silent pairs
             "pipeline.model.no_event_margin": 1.0,
         },
     ),
@@ -64,14 +64,14 @@ PUBLISHED_LOSSES: dict[str, PublishedLosses] = {
             "pipeline.datamanager.silent_mode": "intervals",
             "pipeline.model.sensor.response": "logarithm:0.001",
             "pipeline.model.event_loss": "huber",
-            "pipeline.model.no_event_loss_weight": 0.2,  # its 0.1 for real recordings: `huber_event_loss` is twice its
+            "pipeline.model.no_event_loss_weight": 0.2,  # their 0.1, doubled as in `huber_event_loss`
             "pipeline.model.no_event_margin": 0.0,
         },
     ),
 }
-"""Losses by the names of the methods that have them, as their authors have them for real recordings.
+"""Losses by method name, with the values that their authors use for real recordings.
 
-What is no loss of events stays that of enerf: field, brightness activation, regularisers, and thresholds, which the
-authors of the last two learn. Missing are Robust e-NeRF's loss on derivatives in time, of weight 0.001, for which the
-hash grid would have to be differentiated twice, and the bandwidth of the pixels of Deblur e-NeRF.
+Everything else is that of enerf: field, brightness activation, regularisers, and thresholds, which the authors of the
+last two methods learn. Two parts are missing: the loss of Robust e-NeRF on derivatives in time (weight 0.001), which
+needs second derivatives of the hash grid, and the bandwidth of the pixels in Deblur e-NeRF.
 """

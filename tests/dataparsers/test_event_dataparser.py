@@ -275,16 +275,6 @@ def test_flags_of_the_data_parser():
             tyro.cli(EnerfDataManagerConfig, args=wrong)
 
 
-def test_runs_of_before_there_were_options_can_be_loaded(tmp_path: Path):
-    folder = write_esim(tmp_path / "esim")
-    config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR))
-    del config.format, config.options
-    written = yaml.dump(config)
-    assert "format" not in written and "options" not in written
-    loaded = yaml.load(written, Loader=yaml.Loader)
-    assert len(loaded.setup().get_dataparser_outputs("train").image_filenames) == 2
-
-
 def test_options_are_written_with_a_run(tmp_path: Path):
     config = EventDataParserConfig(data=tmp_path, format="tum_vie", options=TumVieOptions("right"))
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config

@@ -193,7 +193,7 @@ def test_events_that_are_held_out_one_a_pixel_make_no_pair() -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_events_in_gaps_alone_make_no_pair(mode) -> None:
     index = index_of({1: [(t, 1) for t in range(200, 330)], 2: [(10, 1)]})
-    with pytest.raises(ValueError, match="in the time that is looked at, so there is no pair"):
+    with pytest.raises(ValueError, match="in the time that is used, so there is no pair"):
         EventPairSampler(index, mode, stretches=torch.tensor(STRETCHES))
 
 

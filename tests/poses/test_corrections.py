@@ -157,7 +157,7 @@ def test_words_say_each_correction():
     some = Corrections(5.0, -7.0, (np.radians(1.0), 0, 0), (0.003, 0, 0.004), 1.03, 0.01, 0.1, drift, drift)
     assert some.words == [
         "poses stamped +5.00 ms late",
-        "their clock +0.100 ms a second off",
+        "clock rate of the poses +0.100 ms per second off",
         "frames stamped -7.00 ms late",
         "mount turned by 1.00 degrees",
         "mount shifted by 5.0 mm",

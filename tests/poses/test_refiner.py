@@ -293,29 +293,16 @@ def test_a_stored_refiner_goes_on_where_it_was():
     assert torch.equal(first.value, second.value)
 
 
-def test_a_run_from_before_the_rate_of_the_clock_keeps_its_numbers():
-    refiner = PoseRefiner(RefinerConfig(), recording())
-    solved(refiner, {"clock": [4.0], "lens": [0.03, -0.02]})
-    new = refiner.state_dict()
-    old = {name: new[name].clone() for name in ("value", "is_corrected", "normal", "right", "looks")}
-    kept = torch.arange(len(old["right"])) != 1
-    old["value"], old["right"] = old["value"][kept[: len(old["value"])]], old["right"][kept]
-    old["normal"], old["is_corrected"] = old["normal"][kept][:, kept], old["is_corrected"][[0, 2, 3, 4, 5]]
-    again = noisy()
-    again.load_state_dict(old)
-    assert again.corrected == refiner.corrected
-    for part in refiner.parts:
-        np.testing.assert_array_equal(found(again, part), found(refiner, part))
-
-
-def test_findings_say_what_was_found_and_what_is_not_told():
+def test_findings_state_values_and_whether_they_are_identifiable():
     refiner = PoseRefiner(RefinerConfig(), recording())
     solved(refiner, {"clock": [4.0]})
     clock, *others = findings(refiner, 2.0)
-    assert clock.is_corrected and clock.is_told and clock.value.startswith("+4.0") and clock.flag.endswith("clock")
+    assert (
+        clock.is_corrected and clock.is_identifiable and clock.value.startswith("+4.0") and clock.flag.endswith("clock")
+    )
     assert not any(row.is_corrected for row in others) and all(row.pixels < 1e-6 for row in others)
     nothing = findings(PoseRefiner(RefinerConfig(), recording()), 2.0)
-    assert not any(row.is_told for row in nothing if row.what != "drift")
+    assert not any(row.is_identifiable for row in nothing if row.what != "drift")
 
 
 def test_a_pictures_shift_is_that_of_the_focal_length_and_of_a_turn():

@@ -475,7 +475,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "all events of a hot pixel": (
         lambda folder: [save(f"events/{name}.npy", column)(folder) for name, column in one_pixel().items()],
-        "holds 600 events, of which 600 are of 1 hot pixel, with over 10 times as many as around",
+        "holds 600 events, of which 600 are from 1 hot pixel, with over 10 times the events of the neighbourhood",
     ),
     "x missing": (remove("events/x.npy"), "events/x.npy is missing"),
     "p missing": (remove("events/p.npy"), "events/p.npy is missing"),

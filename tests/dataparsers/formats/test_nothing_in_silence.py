@@ -61,7 +61,7 @@ def test_times_that_went_through_float32_are_said(tmp_path: Path, stored: type):
     for file in (tmp_path / "esim/events").iterdir():
         np.save(file, np.load(file).astype(np.float32).astype(stored))
     (found,) = (problem for problem in find_problems(read_recording(tmp_path / "esim")) if "float32" in problem.what)
-    assert "at 0.333 s tell 32 ns apart" in found.what and "int64" in found.advice
+    assert "resolve 32 ns at 0.333 s" in found.what and "int64" in found.advice
 
 
 @pytest.mark.parametrize("unit", [1, 1000, 10_000, 1_000_000])

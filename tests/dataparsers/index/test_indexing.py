@@ -75,7 +75,7 @@ def test_one_selection_is_indexed_once_and_another_one_by_itself():
         ([1, 2, 6, 7], r"memory, event 2 holds polarity 7, but"),
     ],
 )
-def test_what_is_wrong_with_an_event_is_said_with_its_number(row: list[int], message: str):
+def test_an_error_of_an_event_names_its_number(row: list[int], message: str):
     with pytest.raises(RecordingError, match=message):
         index_events(recording(np.array([[1, 2, 5, 1], row, [1, 2, 9, 1]])))
 

@@ -1,4 +1,4 @@
-"""Events warped to one instant, against points whose places are known."""
+"""Motion-compensated events, compared with points in known places."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def test_windows_hold_the_events_of_their_time_and_poses_for_every_delay(focus: 
         assert window.start - focus.largest_delay >= 0 and window.end + focus.largest_delay <= 1_999_000_000
 
 
-def test_warped_events_lie_where_the_camera_saw_the_points(focus: EventFocus):
+def test_compensated_events_lie_where_the_camera_saw_the_points(focus: EventFocus):
     """At the places to which the points are projected in closed form, and hardly elsewhere."""
     for window in focus.windows:
         picture, _ = focus.picture(window)
-        unwarped, _ = focus.picture(window, None)
+        as_fired, _ = focus.picture(window, None)
         pose = focus.recording.trajectory.poses(torch.as_tensor(window.instant)).numpy()
         seen = (POINTS - pose[:, 3]) @ pose[:, :3]
         at = np.rint(150 * seen[:, :2] / seen[:, 2:] + [79.5, 59.5]).astype(int)
@@ -45,7 +45,7 @@ def test_warped_events_lie_where_the_camera_saw_the_points(focus: EventFocus):
         near = np.zeros(picture.shape, bool)
         for x, y in at[inside]:
             near[y - 1 : y + 2, x - 1 : x + 2] = True
-        assert picture[near].sum() / picture.sum() > 0.6 > 1.5 * unwarped[near].sum() / unwarped.sum()
+        assert picture[near].sum() / picture.sum() > 0.6 > 1.5 * as_fired[near].sum() / as_fired.sum()
 
 
 def test_sharpness_is_the_variance_of_the_picture_for_each_event(focus: EventFocus):

