@@ -13,6 +13,7 @@ from enerf_ns.bench.numerics.case import Case, as_json, as_markdown, run
 from enerf_ns.scripts.check_numerics import CheckNumerics
 
 
+@pytest.mark.sweep(16)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_numbers_hold(case: Case):
     result = run(case)

@@ -81,6 +81,7 @@ def same(one: Any, other: Any, where: str = "") -> None:
         assert one == other, where
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("by", ["signal", "kill"])
 @pytest.mark.parametrize(
     ("changes", "first"),

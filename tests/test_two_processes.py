@@ -24,10 +24,25 @@ def two_process_config(recording: Path, folder: Path) -> Any:
     return config
 
 
-def train_one_of_two(rank: int, recording: Path, folder: Path) -> None:
-    """What one process does; its losses and the field after each step are stored."""
+def one_of_two(rank: int, recording: Path, folder: Path) -> None:
+    """The work of one process for both tests: starting two costs more than all else here."""
     torch.set_num_threads(1)
     torch.distributed.init_process_group("gloo", f"file://{folder / 'meet'}", rank=rank, world_size=2)
+    weigh_one_of_two(rank, folder)
+    train_one_of_two(rank, recording, folder)
+    torch.distributed.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def both(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with what two processes have stored."""
+    folder = tmp_path_factory.mktemp("both")
+    spawn(one_of_two, (recording, folder), nprocs=2)
+    return folder
+
+
+def train_one_of_two(rank: int, recording: Path, folder: Path) -> None:
+    """Stores its losses, and the field after each step."""
     config = two_process_config(recording, folder / f"process-{rank}")
     config.machine.seed += rank  # as Nerfstudio does
     trainer = set_up(config, rank, 2)
@@ -38,13 +53,11 @@ def train_one_of_two(rank: int, recording: Path, folder: Path) -> None:
         field = {name: value.clone() for name, value in trainer.pipeline.model.state_dict().items()}
         found.append({"loss": loss.detach(), "drawn": drawn, "field": field})
     torch.save(found, folder / f"{rank}.pt")
-    torch.distributed.destroy_process_group()
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one_would_with_both_batches(recording: Path, tmp_path: Path) -> None:
-    spawn(train_one_of_two, (recording, tmp_path), nprocs=2)
-    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+def test_two_processes_train_as_one_would_with_both_batches(recording: Path, both: Path, tmp_path: Path) -> None:
+    one, other = (torch.load(both / f"{rank}.pt") for rank in (0, 1))
     trainers, states = [], []
     for rank in (0, 1):
         config = two_process_config(recording, tmp_path / f"alone-{rank}")
@@ -78,19 +91,16 @@ def test_two_processes_train_as_one_would_with_both_batches(recording: Path, tmp
 
 
 def weigh_one_of_two(rank: int, folder: Path) -> None:
-    """What one process does; the weight that it finds and what it remembers are stored."""
-    torch.distributed.init_process_group("gloo", f"file://{folder / 'meet'}", rank=rank, world_size=2)
+    """Stores the weight that it finds, and the errors that it remembers."""
     balance = ErrorBalance()
     weight = balance(torch.tensor(1.0 + 2.0 * rank), 100, torch.tensor(0.1 + 0.3 * rank), 50)
     if rank == 0:  # which alone evaluates, and must not wait for the other
         assert balance.eval()(torch.tensor(9.0), 1, torch.tensor(9.0), 1) == 2.0 / 0.25
-    torch.save((weight, balance.errors), folder / f"{rank}.pt")
-    torch.distributed.destroy_process_group()
+    torch.save((weight, balance.errors), folder / f"weight-{rank}.pt")
 
 
 @pytest.mark.slow
-def test_two_processes_weigh_frames_by_the_errors_of_both(tmp_path: Path) -> None:
-    spawn(weigh_one_of_two, (tmp_path,), nprocs=2)
-    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+def test_two_processes_weigh_frames_by_the_errors_of_both(both: Path) -> None:
+    one, other = (torch.load(both / f"weight-{rank}.pt") for rank in (0, 1))
     torch.testing.assert_close(one, other, rtol=0, atol=0)
     torch.testing.assert_close(one[0], torch.tensor(50 / 100 * 2.0 / 0.25))
