@@ -88,6 +88,7 @@ def slow(*values: object):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize(
     ("name", "size"),
     [
@@ -116,6 +117,7 @@ def test_summed_events_stay_within_a_threshold_of_the_brightness_at_any_time(nam
     assert np.ptp(true, axis=0).mean() > 2 * threshold and len(events) > 10 * sums[0].size
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize(
     ("name", "size"),
     [

@@ -216,6 +216,7 @@ def test_the_shortest_trajectories_have_poses_enough():
     assert sampled(trajectory, 120).times.tolist() == [0, 4_000_000]
 
 
+@pytest.mark.sweep(3)
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_every_ray_of_every_motion_hits_something(scene, motion):

@@ -443,6 +443,7 @@ def same(first: Scene, second: Scene) -> bool:
     return all(np.array_equal(vars(first)[name], vars(second)[name]) for name in vars(first))
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_the_same_seed_makes_the_same_preset(name):

@@ -103,6 +103,7 @@ def test_a_room_whose_faces_look_outwards_is_refused_with_what_to_do():
         check(scene_of(box([6, 6, 6], [0, 0, 0])), line([-1, 0, 0], [1, 0, 0]))
 
 
+@pytest.mark.sweep(3)
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_own_motions_are_fine_in_the_own_scenes(scene: str, motion: str):
