@@ -153,7 +153,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         config = self.config
         assert config.train_num_rays_per_batch is not None
         self.generator = torch.Generator(self.device).manual_seed(torch.initial_seed() % 2**63)
-        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, config.train_num_rays_per_batch)
+        self.train_pixel_sampler = config.pixel_sampler.setup(num_rays_per_batch=config.train_num_rays_per_batch)
         if self.test_mode == "val" and "events" in config.supervision:
             _ = (
                 self.pair_sampler,

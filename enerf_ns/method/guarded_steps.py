@@ -14,6 +14,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Module, Parameter
 
 from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.method.nerfstudio_seams import leave_out_fused_step
 from enerf_ns.method.pipeline import TrainStep
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.event_supervision import brightness_change
@@ -58,8 +59,7 @@ class GuardedOptimizers(Optimizers):
                 for gradient in sorted(gradients, key=Tensor.numel)[:1]:
                     gradient.masked_fill_(~self.finite, torch.nan)
             elif optimizer.defaults.get("fused"):
-                optimizer.found_inf = (~self.finite).float()  # type: ignore[attr-defined] - as GradScaler tells it
-                optimizer.grad_scale = None  # type: ignore[attr-defined]
+                leave_out_fused_step(optimizer, ~self.finite)
             elif not self.finite:
                 continue
             taken.append(group)

@@ -75,13 +75,12 @@ def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:
 
     What Nerfstudio logs goes to this run from now on, and to none before it in this process.
     """
-    from nerfstudio.utils import writer
+    from enerf_ns.method.nerfstudio_seams import start_new_logs
 
     random.seed(config.machine.seed)
     np.random.seed(config.machine.seed)  # noqa: NPY002 - libraries draw from it
     torch.manual_seed(config.machine.seed)
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
+    start_new_logs()
     trainer: EnerfTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer

@@ -65,15 +65,13 @@ from enerf_ns.method.guarded_steps import (
     why_nothing_is_learnt,
 )
 from enerf_ns.method.model import EnerfModel
+from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
 from enerf_ns.method.throughput import batch_factor
 from enerf_ns.poses.findings import findings
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
-
-SAMPLER_COUNTERS = ("_step", "_steps_since_update")
-"""What Nerfstudio's proposal sampler remembers from step to step."""
 
 POSES_FILE = "poses.json"
 """What was found to be wrong with clock, poses and lens, in the folder of a run."""
@@ -132,7 +130,7 @@ class EnerfTrainerConfig(TrainerConfig):
         config.load_dir = self.load_dir and absolute(self.load_dir)
         config.load_checkpoint = self.load_checkpoint and absolute(self.load_checkpoint)
         checkpoint = config.checkpoint()
-        decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
+        decays = load_checkpoint(checkpoint)["max_steps"] if checkpoint else {}
         for name, group in config.optimizers.items():
             scheduler = group["scheduler"]
             scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
@@ -306,6 +304,7 @@ class EnerfTrainerConfig(TrainerConfig):
             silence_known_warnings()
             config = self.resolved()
             config.load_checkpoint, config.load_dir = config.checkpoint(), None
+            config.data = None  # so that the viewer keeps camera paths with the run
             with without_chatter():
                 return self._target(config, **kwargs)
 
@@ -341,16 +340,14 @@ class EnerfTrainer(Trainer):
     @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         config = self.config
-        data, config.data = config.data, None  # so that the viewer keeps camera paths with the run
-        try:
-            with without_chatter():
-                super().setup(test_mode)
-        finally:
-            config.data = data
+        with without_chatter():
+            super().setup(test_mode)
         self.pipeline.num_steps = config.max_num_iterations
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )
+        if config.load_checkpoint is not None:
+            self._resume(load_checkpoint(config.load_checkpoint))
         if is_main_process():  # of those that train together, one tells of it
             self._say_how_long()
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
@@ -369,22 +366,16 @@ class EnerfTrainer(Trainer):
                 f"{duration(seconds)} on the {self.device}: enerf takes minutes; this is for a GPU."
             )
 
-    def _check_viewer_warnings(self) -> None:
-        """Nothing: evaluation runs under every `--vis`."""
-
     def setup_optimizers(self) -> GuardedOptimizers:
         return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
 
-    def _load_checkpoint(self) -> None:
-        super()._load_checkpoint()
-        if self.config.load_checkpoint is None:
-            return
-        state = load_checkpoint(self.config.load_checkpoint)
-        if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
+    def _resume(self, state: dict[str, Any]) -> None:
+        """Restores what this class stores in a checkpoint beside Nerfstudio's own, which is restored by then."""
+        if state["device"] == self.pipeline.device.type:
             set_random_state(state["generators"], self.pipeline.device)
             self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
-        vars(self.pipeline.model.sampler).update(state.get("sampler", {}))
-        self._recorded = state.get("error_against_time")
+        set_sampler_counters(self.pipeline.model.sampler, state["sampler"])
+        self._recorded = state["error_against_time"]
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -403,9 +394,7 @@ class EnerfTrainer(Trainer):
                 **random_state(pipeline.device),
                 "batches": pipeline.datamanager.generator.get_state(),
             },
-            "sampler": {
-                name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
-            },
+            "sampler": sampler_counters(pipeline.model.sampler),
             "error_against_time": self.error_against_time.state(),
         }
         path = checkpoint_path(self.checkpoint_dir, step)
@@ -484,10 +473,7 @@ class EnerfTrainer(Trainer):
         self._restore_signals()
         with self.train_lock:
             self.error_against_time.finish()
-        writer.write_out_storage()
-        for log in writer.EVENT_WRITERS:
-            if isinstance(log, writer.TensorboardWriter):
-                log.tb_writer.flush()
+        flush_tensorboard()
 
     def _is_finite(self) -> Tensor:
         """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.

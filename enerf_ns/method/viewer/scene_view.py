@@ -21,6 +21,7 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.datamanager import EnerfDataManager
 from enerf_ns.method.model import EnerfModel, Outputs
+from enerf_ns.method.nerfstudio_seams import replace_camera_callbacks, replace_renderer, tidy_control_panel
 from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events
 from enerf_ns.method.viewer.seen_rays import SeenRays
 from enerf_ns.method.viewer.view_renderer import ViewRenderer
@@ -124,15 +125,12 @@ class SceneView(ViewerControl):
 
     def _tidy_up(self) -> None:
         """Sizes that suit the scene, where none are set; and nothing to press that changes nothing."""
-        viewer, panel, defaults = self.viewer, self.viewer.control_panel, ViewerConfig()
+        viewer, defaults = self.viewer, ViewerConfig()
         if viewer.config.camera_frustum_scale == defaults.camera_frustum_scale:
             viewer.config.camera_frustum_scale = FRUSTUM * self._depth * VISER_NERFSTUDIO_SCALE_RATIO
         if viewer.config.max_num_display_images == defaults.max_num_display_images:
             viewer.config.max_num_display_images = MOST_CAMERAS
-        panel._max_res.value = FULL_WIDTH
-        panel._crop_handle.visible = False  # until a crop is enabled
-        panel._train_speed.set_hidden(True)  # these set max res, and what nothing reads
-        panel._train_util.set_hidden(True)
+        tidy_control_panel(viewer.control_panel, FULL_WIDTH)
         if viewer.trainer is None:
             viewer.pause_train.visible = viewer.resume_train.visible = False
 
@@ -184,7 +182,7 @@ class SceneView(ViewerControl):
             self._depths = gui.add_markdown("")
             self._corrected = gui.add_markdown(self._corrections_in_words)
         for handle in (self._events, self._window, self._stops, self._gamma):
-            handle.on_update(lambda _: self.viewer._trigger_rerender())
+            handle.on_update(lambda _: self._render())
         self._time.on_update(lambda _: self._move())
         self._follows.on_update(lambda _: self._move())
         self._plays.on_update(lambda _: threading.Thread(target=self._play, daemon=True).start())
@@ -192,16 +190,12 @@ class SceneView(ViewerControl):
 
     def _open(self, client: viser.ClientHandle) -> None:
         """Shows a browser the first view, and renders for it from now on."""
-        own = self.viewer.render_statemachines[client.client_id]
-        own.running = False
-        own.render_trigger.set()  # so that it ends before it has rendered anything
         renderer = ViewRenderer(self.viewer, client, self._rays_per_second, self._limit, self._shown)
-        self.viewer.render_statemachines[client.client_id] = renderer
+        replace_renderer(self.viewer, client, renderer)
         pose = self._manager.train_dataset.cameras.camera_to_worlds[self._middle].cpu().double().numpy()
         back = pose[:, 2]
         self._turn(client, pose[:, 3] + BEHIND * self._depth * back, pose[:, 3] - self._depth * back, self._up)
-        client.camera._state.camera_cb.clear()  # of Nerfstudio's callback, for which see ours
-        client.camera.on_update(self._moved)
+        replace_camera_callbacks(client, self._moved)
         self.viewer.update_step(self.viewer.step)
         renderer.start()
 
@@ -214,16 +208,22 @@ class SceneView(ViewerControl):
             client.camera.look_at = target * VISER_NERFSTUDIO_SCALE_RATIO
 
     def _moved(self, view: viser.CameraHandle) -> None:
-        """Renders for a browser that says where it is.
-
-        Handles are heard in threads of their own, so that it may have gone since. Nerfstudio's own callback then fails
-        with viser's lock in hand, which nobody gives back: no message is sent any more, and Python does not end.
-        """
-        renderer = self.viewer.render_statemachines.get(view.client.client_id)
-        if renderer is not None:
+        """Renders for a browser whose camera has moved, unless it has gone since."""
+        if view.client.client_id in self.viewer.render_statemachines:
             self._fit(view)
             self.viewer.last_move_time = time.time()  # type: ignore - starts as an int
-            renderer.action(RenderAction("move", self.viewer.get_camera_state(view.client)))
+            self._render_for(view.client)
+
+    def _render(self) -> None:
+        """Renders anew for all browsers."""
+        for client in self.viser_server.get_clients().values():
+            self._render_for(client)
+
+    def _render_for(self, client: viser.ClientHandle) -> None:
+        """Renders anew for a browser, unless it has gone since: handles are heard in threads of their own."""
+        renderer = self.viewer.render_statemachines.get(client.client_id)
+        if renderer is not None:
+            renderer.action(RenderAction("move", self.viewer.get_camera_state(client)))
 
     def _fit(self, view: viser.CameraHandle) -> None:
         """Has a view show all that the sensor sees, also where panels make it narrow."""
@@ -263,7 +263,7 @@ class SceneView(ViewerControl):
             if self._follows.value:
                 for client in self.viser_server.get_clients().values():
                     self._turn(client, pose[:, 3], pose[:, 3] + self._depth * pose[:, 2], -pose[:, 1])
-        self.viewer._trigger_rerender()
+        self._render()
 
     def _play(self) -> None:
         """Moves the time on for as long as it is to play; from the end it goes on at the start."""
