@@ -162,7 +162,7 @@ def set_sampler_counters(sampler: Sampler, counters: Mapping[str, int]) -> None:
 
 
 def leave_out_fused_step(optimizer: torch.optim.Optimizer, left_out: Tensor) -> None:
-    """Has the next step of a fused Adam change nothing where a boolean on its device is true.
+    """Makes the next step of a fused Adam change nothing if a boolean on its device is true.
 
     The fused kernels of torch 2.11 read these two attributes, by which GradScaler leaves out steps. There is no public
     way to do so without a GradScaler, but to wait for the boolean, in which time a GPU idles.
