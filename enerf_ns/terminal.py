@@ -69,6 +69,7 @@ CHATTER = (
     "No Nerfstudio checkpoint to load",
     "[bold yellow]Disabled comet",
     "disabled local writer",
+    "[NOTE] Not running eval iterations since",
 )
 """How lines of Nerfstudio begin that tell a person nothing, or a path in which brackets are taken for colours."""
 

@@ -249,7 +249,7 @@ def test_what_is_left_is_told_of_the_run_as_a_whole(recording: Path, tmp_path: P
         ("load_dir", b"a file", "is no folder; give nerfstudio_models of a trained run"),
         ("load_dir", {"notes.txt": b"stray", "step-000000001.ckpt": b"stray"}, "holds no whole checkpoint; give nerf"),
         ("load_checkpoint", None, "does not exist; give another"),
-        ("load_checkpoint", b"stray", "is cut short, damaged or none; give another"),
+        ("load_checkpoint", b"stray", "is cut short or damaged, or is no checkpoint; give another"),
     ],
 )
 def test_a_checkpoint_that_is_none_is_one_sentence(

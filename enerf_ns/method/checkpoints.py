@@ -1,5 +1,7 @@
-"""What is stored of a run: its config.yml, and checkpoints that are whole or not there, and hold what the run needs to
-go on as if it had not stopped."""
+"""The files of a run: its config.yml, and checkpoints, which are stored whole or not at all.
+
+A checkpoint holds all that a run needs to continue as if it had not stopped.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +25,14 @@ from enerf_ns.terminal import say
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """The configuration of a run, of any method.
+    """The configuration of a run of any method.
 
     Args:
-        path: Its config.yml.
+        path: config.yml of the run.
 
     Raises:
-        RecordingError: The file is missing, cannot be read, is of no run, or names classes that are not installed, as
-            of an earlier version.
+        RecordingError: The file is missing, cannot be read, is not the config of a run, or names classes that are not
+            installed.
     """
     with reading(path, "the config.yml of a run"):
         text = path.read_text()
@@ -38,8 +40,8 @@ def read_config(path: Path) -> TrainerConfig:
             config = yaml.load(text, Loader=yaml.Loader)  # as Nerfstudio reads it
         except yaml.constructor.ConstructorError as error:
             raise RecordingError(
-                f"{path} names what is not installed ({error.problem}); install the package of its method, or, if an "
-                "earlier version of this one wrote it, edit it as docs/training.md shows (“Runs of earlier versions”)."
+                f"{path} names what is not installed ({error.problem}); install the package of its method, in the "
+                "version that wrote it."
             ) from error
     if not isinstance(config, TrainerConfig):
         raise RecordingError(f"{path} is not the config.yml of a run; give the folder of a run.")
@@ -47,18 +49,18 @@ def read_config(path: Path) -> TrainerConfig:
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
-    """The checkpoint after a step, as Nerfstudio names it."""
+    """The path of the checkpoint of a step, as Nerfstudio names it."""
     return folder / f"step-{step:09d}.ckpt"
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The newest whole checkpoint of a folder; one that is not whole is passed over, which is said once.
+    """The newest whole checkpoint of a folder. A checkpoint that is not whole is skipped, with one line in yellow.
 
     Args:
-        folder: nerfstudio_models of a run, with whatever else lies in it.
+        folder: nerfstudio_models of a run; other files in it are ignored.
 
     Returns:
-        None where there is no such folder.
+        None if the folder does not exist.
 
     Raises:
         RecordingError: The folder holds no checkpoint, or none that is whole.
@@ -75,18 +77,18 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether all of a checkpoint is there as it was written, by the checksums in it, and torch can read it as one."""
+    """Whether a file is a checkpoint that torch can read, and its checksums are right."""
     try:
         with zipfile.ZipFile(path) as archive:
             sound = archive.testzip() is None
         state = load_checkpoint(path)
         return sound and {"step", "pipeline", "optimizers"} <= state.keys()
-    except Exception:  # of any kind, depending on where the damage lies
+    except Exception:  # the kind depends on where the damage lies
         return False
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """What a checkpoint holds; its tensors are read when they are used."""
+    """The content of a checkpoint. Its tensors are read from the file when they are used."""
     allow_numpy_scalars_in_checkpoints()
     return torch.load(path, map_location="cpu", mmap=True)
 
@@ -97,16 +99,16 @@ def _say_passed_over(path: Path) -> None:
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Stores a checkpoint whole or not at all, also where the power fails.
+    """Stores a checkpoint whole or not at all, even where the power fails.
 
     The unfinished file lies above the folder of the checkpoint, since Nerfstudio reads a step from every name in it.
 
     Args:
-        path: Its folder is made where it does not exist.
+        path: File of the checkpoint; its folder is made if it does not exist.
         state: Tensors and plain Python values.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written to; nothing is left then.
+        OSError: The disk is full, or the folder cannot be written to; no file is left then.
     """
     content = io.BytesIO()
     torch.save(state, content)
@@ -124,10 +126,10 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def random_state(device: torch.device) -> dict[str, Any]:
-    """The states of the generators that are the process's, as tensors and plain Python values.
+    """The states of the global random generators of the process, as tensors and plain Python values.
 
     Args:
-        device: Whose generator is stored too, where it is a CUDA device.
+        device: Device of the training; the state of its generator is stored too if it is a CUDA device.
     """
     name, keys, *rest = np.random.get_state()  # noqa: NPY002 - libraries draw from it
     return {
@@ -139,7 +141,7 @@ def random_state(device: torch.device) -> dict[str, Any]:
 
 
 def set_random_state(state: dict[str, Any], device: torch.device) -> None:
-    """Puts the generators of the process into the states that `random_state` gave."""
+    """Sets the global random generators of the process to the states that `random_state` gave."""
     torch.set_rng_state(state["torch"])
     if state["cuda"] is not None and device.type == "cuda":
         torch.cuda.set_rng_state(state["cuda"], device)

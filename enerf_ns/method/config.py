@@ -1,4 +1,4 @@
-"""The methods that Nerfstudio knows of after this package is installed."""
+"""The methods that this package registers with Nerfstudio."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     betas: Tuple[float, float] = (0.9, 0.99)  # noqa: UP006
     """Decay of Adam's running means."""
     fused: bool = True
-    """Take the whole step in one kernel; on a hash grid several times faster than the loop."""
+    """Update all parameters in one kernel, which is several times faster than a loop on a hash grid."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class DecayOverRunSchedulerConfig(ExponentialDecaySchedulerConfig):
     """Learning rate that falls exponentially from the first step to the last."""
 
     max_steps: Optional[int] = None  # type: ignore  # noqa: UP045
-    """Step at which lr_final is reached. None: the last step of the run."""
+    """Step at which lr_final is reached. Default: the last step of the run."""
 
 
 SENSOR_LEARNING_RATES = {
@@ -48,19 +48,19 @@ SENSOR_LEARNING_RATES = {
     "leak_rate": 3e-2,
     "sensor": 1e-3,
 }
-"""Learning rates of what is learned of the sensor, by the name of its group; parameters near 1."""
+"""Learning rate of each group of sensor parameters, by its name. The parameters are scaled to be near 1."""
 
 
 def method_config(
     name: str, iterations: int, learning_rate: float, pipeline: EnerfPipelineConfig
 ) -> EnerfTrainerConfig:
-    """A trainer whose learning rate falls to a tenth over the run, on the device that the machine has."""
+    """The config of a method, on the GPU if there is one. Its learning rates fall to a tenth over the run."""
     pipeline.defaults = replace(pipeline.defaults, settings=_settings(pipeline))
     return EnerfTrainerConfig(
         method_name=name,
         max_num_iterations=iterations,
         steps_per_save=1000,
-        steps_per_eval_batch=0,  # never: runs record their error themselves
+        steps_per_eval_batch=0,  # never: ErrorAgainstTime evaluates runs
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         mixed_precision=False,
@@ -86,7 +86,7 @@ def method_config(
 
 
 def _settings(pipeline: EnerfPipelineConfig) -> tuple[tuple[str, Any], ...]:
-    """What a pipeline's config holds that is not the default of its class, as `MethodDefaults.settings` has it."""
+    """The settings of a pipeline that differ from the defaults of their classes, as `MethodDefaults.settings`."""
     found = []
     for section in ("datamanager", "model", "model.sensor"):
         part = attrgetter(section)(pipeline)
@@ -101,11 +101,11 @@ def _settings(pipeline: EnerfPipelineConfig) -> tuple[tuple[str, Any], ...]:
 
 
 RAYS_PER_CHUNK = 1 << (15 if torch.cuda.is_available() else 12)
-"""Rays rendered at once: enough to keep the device busy, few enough for the cache of a CPU."""
+"""Rays rendered at once: enough to keep a GPU busy, few enough for the cache of a CPU."""
 
 
 def _enerf(name: str, settings: Mapping[str, Any]) -> EnerfTrainerConfig:
-    """The method enerf under a name, with other settings, by the names of ns-train's flags."""
+    """The method enerf under another name, with changes of settings by the names of ns-train's flags."""
     model = EnerfModelConfig(eval_num_rays_per_chunk=RAYS_PER_CHUNK)
     pipeline = EnerfPipelineConfig(datamanager=EnerfDataManagerConfig(), model=model)
     for path, value in settings.items():

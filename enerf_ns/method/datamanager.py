@@ -1,4 +1,4 @@
-"""What one training step draws, and the rays of it."""
+"""The data manager: it draws the batch of a training step, and makes its rays."""
 
 from __future__ import annotations
 
@@ -56,64 +56,65 @@ EventDataParserUnion = OmitSubcommandPrefixes[
 ]
 
 DIRECTIONS_NORM = "directions_norm"
-"""Name that Nerfstudio has among the metadata of rays for the length along each of one unit along the optical axis."""
+"""Name in the metadata of Nerfstudio's rays for the length along a ray of one unit along the optical axis."""
 
 
 @dataclass
 class EnerfDataManagerConfig(VanillaDataManagerConfig):
-    """Event pairs, silent pixels and frame pixels of a recording. What is None is chosen when training starts."""
+    """Pairs of events, silent pixels and pixels of frames of a recording. Fields that are None are filled in from the
+    recording when training starts."""
 
     _target: Type = field(default_factory=lambda: EnerfDataManager)  # noqa: UP006
     dataparser: EventDataParserUnion = field(default_factory=EventDataParserConfig)  # type: ignore
     """Format of the recording."""
     supervision: Literal["events", "events+frames", "frames"] = "events"
-    """What the field learns from."""
+    """Data from which the field learns."""
     event_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of instants with events between them, drawn at each step. None: 1024, beside pairs of any instants 683,
-    of noisy events beside frames 256, or as the paper for enerf-paper."""
+    """Pairs of events of a pixel that are drawn at each step. Default: 1024; with pairs of any two instants 683; with
+    noisy events and frames 256; for enerf-paper, the number of the paper."""
     pair_mode: Optional[Literal["successor", "partner", "window", "accumulated"]] = None  # noqa: UP045
-    """The other event of a pair: the pixel's next; one of its next few; its last in a window of time. Or no two events,
-    but a window of any length whose events are summed, as in EventNeRF (accumulated). None: one of the next few, but
-    the next where the sensor has a refractory period, in which changes go unseen."""
+    """Second event of a pair: the next event of the pixel (successor), one of its next few (partner), or its last event
+    within a window of time (window). Or a window of any length whose events are summed, as in EventNeRF (accumulated).
+    Default: partner; successor where the sensor has a refractory period, in which it misses changes."""
     max_pair_distance: Optional[int] = None  # noqa: UP045
-    """Events of the pixel that a partner may lie ahead, for pair-mode partner. None: as many as the noise of the events
-    leaves worth adding up, at most 10."""
+    """Largest number of events of the pixel from one event of a pair to the other, for pair-mode partner. Default: as
+    many as the noise of the events makes useful, at most 10."""
     instant_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of any two instants of a pixel, drawn at each step beside those of events: what its events between them add
-    up to, if any. None: half of all pairs, in place of silent ones, where the field learns from events alone and pixels
-    are not blind after an event. 0: none."""
+    """Pairs of any two instants of a pixel that are drawn at each step; they are compared with the sum of the pixel's
+    events between them. Default: half of all pairs, instead of silent pairs, where the field learns from events alone
+    and the sensor has no refractory period; else 0."""
     instants_apart_ms: Optional[float] = None  # noqa: UP045
-    """Longest time between the two instants of such a pair. None: as long as the noise of the events leaves worth
-    adding up."""
+    """Longest time between the two instants of a pair of any instants, ms. Default: as long as the noise of the events
+    makes useful."""
     window_ms: Optional[float] = None  # noqa: UP045
-    """Length of the windows for pair-mode window, and of the longest for accumulated. None: 60; for accumulated a
-    twentieth of the recording."""
+    """Length of the windows for pair-mode window, and of the longest window for pair-mode accumulated, ms. Default: 60;
+    for accumulated, a twentieth of the recording."""
     uniform_over: Literal["pairs", "pixels"] = "pairs"
-    """Draw every pair alike, or every active pixel alike."""
+    """Draw every pair with the same probability (pairs), or every active pixel (pixels)."""
     silent_pairs: Optional[int] = None  # noqa: UP045
-    """Pairs of instants at a pixel that saw no event between them, drawn at each step. None: a third of 1024, beside
-    frames 128, beside pairs of any instants none, or as the paper for enerf-paper. 0: none are searched."""
+    """Pairs of instants of a pixel without an event between them that are drawn at each step. Default: a third of 1024;
+    with frames 128; with pairs of any instants 0; for enerf-paper, the number of the paper."""
     silent_mode: Literal["pixels", "intervals"] = "pixels"
-    """Where silent pairs lie: at any pixel while it is silent for silence-ms, or between any two successive events of a
-    pixel, as in the total variation of Deblur e-NeRF."""
+    """Place of silent pairs: at any pixel that is silent for silence-ms (pixels), or between two successive events of a
+    pixel, as in the total variation of Deblur e-NeRF (intervals)."""
     silence_ms: Optional[float] = None  # noqa: UP045
-    """Shortest silence of a pixel that counts. None: 20, or as the preset."""
+    """Shortest silence of a pixel that counts, ms. Default: 20; with a preset, the value of the preset."""
     held_out_events: float = 0.02
-    """Share of the recording's time, in 8 equal spans spread evenly over it, at which no pair starts or ends: the
-    correlation of events is measured there. 0: none, and it is measured over training pairs."""
+    """Share of the recording's time that is held out from training, in 8 equal spans spread evenly over it. No pair
+    starts or ends there, and the scores of events are measured there. With 0 they are measured over training pairs."""
     train_num_rays_per_batch: Optional[int] = None  # type: ignore[assignment]  # noqa: UP045
-    """Rays of frames at each step, where the field learns from frames. None: 1024, beside events that are not noisy
-    426, or as the paper for enerf-paper."""
+    """Rays of frames at each step, where the field learns from frames. Default: 1024; with events that are not noisy
+    426; for enerf-paper, the number of the paper."""
     exposure_samples: Optional[int] = None  # noqa: UP045
-    """Instants of its exposure over which a pixel of a frame is averaged, of which each takes a ray; 1: it is taken as
-    seen in the middle. None: as many as the motion needs, where the exposures are known."""
+    """Instants of its exposure over which a pixel of a frame is averaged; each takes one ray. With 1, the pixel is
+    rendered in the middle of the exposure. Default: as many as the motion blur needs, where exposures are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
     corrections: Fixed[Optional[Corrections]] = None  # noqa: UP045
-    """What a loaded run corrects of the poses: for data managers that are made of its configuration later, as by
+    """Corrections of the poses in a run that was loaded, for data managers that are made of its config later, as by
     `ns-render dataset`."""
 
-    # What Nerfstudio's own data manager has, and this one has no use for, is no flag.
+    # fixed, so that they are no flags: this data manager does not read them
     masks_on_gpu: Fixed[bool] = False
     images_on_gpu: Fixed[bool] = False
     train_num_images_to_sample_from: Fixed[int] = -1
@@ -125,17 +126,13 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     patch_size: Fixed[int] = 1
     camera_optimizer: Fixed[Optional[CameraOptimizerConfig]] = None  # noqa: UP045
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before events were held out, and before pairs of any instants, too."""
-        self.__dict__.update({"held_out_events": 0.0, "instant_pairs": 0, "instants_apart_ms": 0.0, **state})
-
 
 class EnerfDataManager(VanillaDataManager[EventDataset]):
-    """Draws what the sensor saw, and makes rays of it. What it needs for either is made when first asked for."""
+    """Draws batches of a recording, and makes their rays. Samplers and cameras are made when they are first used."""
 
     config: EnerfDataManagerConfig
     corrections = Corrections()
-    """What is corrected of the recording by now."""
+    """Current corrections of clock, poses and lens."""
     train_dataset: EventDataset
     eval_dataset: EventDataset
 
@@ -146,21 +143,21 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             self.correct(config.corrections)
 
     def get_datapath(self) -> Path:
-        """Where `ns-viewer` keeps camera paths: not with the recording, which is only read."""
+        """The folder in which `ns-viewer` keeps camera paths: the working directory, since recordings are only read."""
         return Path.cwd()
 
     def setup_train(self) -> None:
         config = self.config
         assert config.train_num_rays_per_batch is not None
         self.generator = torch.Generator(self.device).manual_seed(torch.initial_seed() % 2**63)
-        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, config.train_num_rays_per_batch)
+        self.train_pixel_sampler = config.pixel_sampler.setup(num_rays_per_batch=config.train_num_rays_per_batch)
         if self.test_mode == "val" and "events" in config.supervision:
             _ = (
                 self.pair_sampler,
                 self.silent_sampler,
                 self.instant_sampler,
                 self.held_out_pair_sampler,
-            )  # so that what cannot be drawn is found before training
+            )  # so that an error in making them comes before training
 
     def setup_eval(self) -> None:
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
@@ -172,18 +169,18 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @property
     def recording(self) -> EventRecording:
-        """The recording that is learnt from."""
+        """The recording, with its current corrections."""
         return self.train_dataset.recording
 
     @property
     def distance(self) -> float:
-        """Usual depth of the scene, metres."""
+        """Typical depth of the scene in metres: the geometric mean of its nearest and farthest depth."""
         near, far = scene_depth_range(self.recording, self.config.dataparser.depth_range)
         return math.sqrt(near * far)
 
     @property
     def held_out_spans(self) -> Int64[np.ndarray, "spans 2"]:
-        """First and last instant (ns) of each span of time whose events are kept from training."""
+        """First and last instant (ns) of each span of time that is held out from training."""
         share = self.config.held_out_events
         return self.recording.spans(HELD_OUT_SPANS, share) if share else np.zeros((0, 2), np.int64)
 
@@ -194,10 +191,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def pair_sampler(self) -> EventPairSampler | AccumulationSampler:
-        """Draws event pairs as the config says.
+        """The sampler of pairs of events that the config names.
 
         Raises:
-            FlagError: There is none to draw.
+            FlagError: The recording has no such pair.
         """
         config = self.config
         assert config.pair_mode is not None and config.window_ms is not None
@@ -218,7 +215,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def held_out_pair_sampler(self) -> HeldOutPairSampler | str:
-        """Draws pairs of events that both are held out, as far apart as those of the training; or why there is none."""
+        """The sampler of pairs whose two events are held out, as far apart as training pairs; or a sentence that says
+        why there is no such pair."""
         spans = torch.from_numpy(overlaps(self.recording.stretches, self.held_out_spans)).to(self.device)
         try:
             successors = self.config.pair_mode == "successor"
@@ -228,7 +226,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def silent_sampler(self) -> SilentPixelSampler | SilentIntervalSampler | None:
-        """Draws silent pixels as the config says; None where it wants none."""
+        """The sampler of silent pixels that the config names; None for silent_pairs 0."""
         if not self.config.silent_pairs:
             return None
         if self.config.silent_mode == "intervals":
@@ -241,7 +239,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def instant_sampler(self) -> InstantPairSampler | None:
-        """Draws pairs of any two instants as the config says; None where it wants none."""
+        """The sampler of pairs of any two instants; None for instant_pairs 0."""
         if not self.config.instant_pairs:
             return None
         assert self.config.instants_apart_ms is not None
@@ -251,24 +249,24 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def event_camera(self) -> PosedCamera:
-        """The camera of the events, in the scene."""
+        """The camera of the events, posed in the scene."""
         return self._posed(self.recording.camera, self.recording.trajectory)
 
     @cached_property
     def event_camera_without_distortion(self) -> PosedCamera:
-        """The camera of undistorted pictures of the events, in the scene."""
+        """The camera of undistorted pictures of the events, posed in the scene."""
         return self._posed(self.recording.camera.undistorted(), self.recording.trajectory)
 
     @cached_property
     def frame_camera(self) -> PosedCamera:
-        """The camera of the pictures that are learnt from, in the scene."""
+        """The camera of the training frames, posed in the scene."""
         frames = self._frames
         return self._posed(frames.picture_camera, frames.trajectory)
 
     @cached_property
     def frame_colours(self) -> Tensor:
-        """All frames that are learnt from, shape (frames, height, width, 3): uint8, or float32 in [0, 1] where one of
-        them has more than 8 bits."""
+        """All training frames, shape (frames, height, width, 3): uint8, or float32 in [0, 1] where a frame has more
+        than 8 bits."""
         pictures = [self.train_dataset.get_numpy_image(i) for i in range(len(self.train_dataset))]
         if any(picture.dtype != np.uint8 for picture in pictures):
             pictures = [brightness(picture) for picture in pictures]
@@ -279,10 +277,10 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return bool((self.frame_colours == self.frame_colours[..., :1]).all())
 
     def next_batch(self, sensor: SensorModel) -> TrainBatch:
-        """Draws what one training step looks at.
+        """Draws the batch of one training step.
 
         Args:
-            sensor: That made the events.
+            sensor: Model of the sensor that made the events.
         """
         self.train_count += 1
         config, events, frames = self.config, None, None
@@ -306,7 +304,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return TrainBatch(events, frames)
 
     def rays(self, batch: TrainBatch, sensor: SensorModel) -> PairedRayBundle:
-        """The rays of a batch, in the order that `TrainBatch.split` takes apart."""
+        """The rays of a batch, in the order of `TrainBatch.split`."""
         bundles: list[RayBundle] = []
         if batch.events is not None:
             bundles.append(self.event_rays(batch.events, sensor))
@@ -330,13 +328,15 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
     def event_rays(
         self, batch: EventBatch, sensor: SensorModel, places: Float[Tensor, "places 2"] | None = None
     ) -> RayBundle:
-        """Rays of all first instants, from when the pixels can see, then of all second ones.
+        """Rays of the first instants of all pairs, then of all second instants.
+
+        A first instant that is an event is delayed to the end of the refractory period of the pixel.
 
         Args:
-            batch: Of pairs.
-            sensor: That made the events.
-            places: Where in its pixel rays go through, x and y from the centre in pixels: of each instant as many rays,
-                one after the other. None: the centre.
+            batch: Pairs of instants.
+            sensor: Model of the sensor that made the events.
+            places: Points in the pixel, x and y from its centre in pixels. Each instant has one ray through each of
+                them, one after the other. Default: the centre alone.
         """
         delays = self._delays(batch, sensor)
         pixels, times = batch.pixels.repeat(2), torch.cat([batch.start, batch.end])
@@ -348,13 +348,13 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return self.event_camera.rays(pixels, times, delays, places=places.repeat(2 * len(batch), 1))
 
     def event_times(self, batch: EventBatch, sensor: SensorModel) -> Int64[Tensor, " rays"]:
-        """When the pixels of a batch look along the rays of `event_rays`, ns."""
+        """Time (ns) of each ray of `event_rays`, with its delay."""
         delays, times = self._delays(batch, sensor), torch.cat([batch.start, batch.end])
         return times if delays is None else times + delays.round().long()
 
     def _delays(self, batch: EventBatch, sensor: SensorModel) -> Tensor | None:
-        """How much later (ns) than at their instants pixels see again, of all first instants and then of all second
-        ones; None where they always do."""
+        """Delay (ns) of each ray against its instant, of first and then of second instants: a pixel is blind for the
+        refractory period after an event. None for a sensor without such a period."""
         delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
         if delays is None:
             return None
@@ -362,22 +362,24 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return torch.cat([delays, torch.zeros_like(delays)])
 
     def correct(self, corrections: Corrections) -> None:
-        """Has rays follow corrected poses, and through a corrected lens, and the cameras of frames too."""
+        """Applies corrections of clock, poses and lens to the rays, and to the cameras of frames.
+
+        They replace earlier corrections.
+        """
         made = ["event_camera", "event_camera_without_distortion", "frame_camera"]
         if corrections.distortion != self.corrections.distortion:
-            made.append("frame_colours")  # which are undistorted
+            made.append("frame_colours")  # since frames are undistorted by the lens
         self.corrections = corrections
         for dataset in (self.train_dataset, self.eval_dataset):
             dataset.correct(corrections)
-        for name in ("fixed_indices_eval_dataloader", "eval_dataloader"):  # which are not there to render alone
+        for name in ("fixed_indices_eval_dataloader", "eval_dataloader"):  # missing in test mode "inference"
             if loader := getattr(self, name, None):
                 loader.cameras = self.eval_dataset.cameras.to(self.device)
         for name in made:
             self.__dict__.pop(name, None)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """Rays of pixels drawn evenly from the train cameras, as ns-export looks at a scene with; training itself takes
-        `next_batch`."""
+        """Rays of random pixels of the train cameras, for ns-export. Training itself calls `next_batch`."""
         assert self.train_pixel_sampler is not None
         indices = self._frame_pixels(self.train_pixel_sampler.num_rays_per_batch)
         return self._frame_rays(indices, self._frame_times[indices[:, :1]]), {"indices": indices}
@@ -386,7 +388,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return self.next_train(step)
 
     def get_train_rays_per_batch(self) -> int:
-        """Rays of one training step, of events and frames together."""
+        """Number of rays of one training step, of events and frames together."""
         config = self.config
         numbers = (config.event_pairs, config.instant_pairs, config.silent_pairs)
         pairs = sum(number or 0 for number in numbers) if "events" in config.supervision else 0
@@ -394,17 +396,17 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return 2 * pairs + (self._num_frame_pixels * instants if "frames" in config.supervision else 0)
 
     def _parts(self, stretches: Int64[np.ndarray, "stretches 2"]) -> Tensor | None:
-        """First and last instant (ns) of parts of the recording, for samplers; None where they are its span."""
+        """Stretches (first and last instant, ns) as the samplers take them; None where they are the whole recording."""
         return None if stretches.tolist() == [[*self.recording.span]] else torch.from_numpy(stretches).to(self.device)
 
     @property
     def _span(self) -> tuple[int, int]:
-        """Times of the first and of the last event that is used, ns."""
+        """Times (ns) of the first and of the last event that is used."""
         return index_events(self.recording).span
 
     @property
     def _stretches(self) -> Tensor | None:
-        """First and last instant (ns) of each part of time that is learnt from; None where that is the whole span."""
+        """First and last instant (ns) of each stretch of time for training; None where that is the whole recording."""
         first, last = self.recording.span
         around = np.concatenate([[first], (self.held_out_spans + np.array([-1, 1])).flatten(), [last]]).reshape(-1, 2)
         return self._parts(overlaps(self.recording.stretches, around))
@@ -418,7 +420,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return PosedCamera(camera, trajectory, outputs.metadata["transform"], outputs.dataparser_scale, self.device)
 
     def _frame_pixels(self, number: int) -> Tensor:
-        """Frame, row and column of pixels drawn evenly, shape (number, 3)."""
+        """Frame, row and column of random pixels, shape (number, 3)."""
         camera = self.frame_camera.camera
         sizes = len(self._frames.times), camera.height, camera.width
         draws = [torch.randint(size, (number,), generator=self.generator, device=self.device) for size in sizes]
@@ -426,7 +428,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @property
     def _num_frame_pixels(self) -> int:
-        """Pixels of frames of one training step, of which each has as many rays as instants."""
+        """Number of pixels of frames in one training step. Each has one ray for each instant of its exposure."""
         assert self.config.train_num_rays_per_batch is not None
         return max(1, self.config.train_num_rays_per_batch // (self.config.exposure_samples or 1))
 
@@ -439,8 +441,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return torch.from_numpy(self._frames.exposed).to(self.device)
 
     def _frame_instants(self, frames: Tensor) -> Tensor:
-        """Instants (ns) at which pixels of these frames are rendered, shape (pixels, instants): one in the middle of
-        the exposure, or one drawn evenly from each of as many equal parts of it."""
+        """Instants (ns) at which pixels of frames are rendered, shape (pixels, instants): the middle of the exposure,
+        or one random instant in each of several equal parts of it."""
         number = self.config.exposure_samples or 1
         if number == 1:
             return self._frame_times[frames, None]

@@ -1,4 +1,4 @@
-"""A run's error against the time that it has trained for, recorded while it trains."""
+"""The error of a run against its training time, recorded while it trains."""
 
 from __future__ import annotations
 
@@ -31,44 +31,44 @@ from enerf_ns.method.pipeline import EnerfPipeline
 from enerf_ns.terminal import StatusLine, clear_line, duration, say
 
 FRAMES = 2
-"""Held-out frames looked at while training, spread evenly over them all."""
+"""Number of held-out frames that are scored during training, spread evenly over all held-out frames."""
 
 MOST_RAYS = 40_000
-"""Rays of these frames together at most; larger frames are looked at reduced."""
+"""Largest number of rays of these frames together; larger frames are reduced."""
 
 PAIRS = 2048
-"""Pairs of held-out events looked at while training."""
+"""Number of pairs of held-out events that are scored during training."""
 
 STEPS_PER_PREVIEW = 500
 """Training steps between two previews."""
 
 PREVIEW_WIDTH = 160
-"""Pixels of the width of each picture of a preview at most."""
+"""Largest width of each picture of a preview, pixels."""
 
 EARLIEST = 0.01
-"""Share of the training time from which on moments are spaced evenly in log time."""
+"""Share of the training time after which moments are spaced evenly in log time."""
 
 SMALLEST_GROWTH = 1.3
-"""Factor of the training time from one moment to the next at least."""
+"""Smallest factor on the training time from one moment to the next."""
 
 STEPS_MEASURED = 100
-"""Last steps whose median time predicts the steps to come."""
+"""Number of last steps whose median time predicts the time of later steps."""
 
 STEPS_BEFORE = 5
-"""Steps before anything is predicted: the first compile and warm up."""
+"""Number of steps before times are predicted, since the first steps compile and warm up."""
 
 
 def next_moment(last: float, total: float, budget: float, cost: float) -> float:
-    """Training time (s) of the next of the moments that are left, evenly spaced in log time up to the end.
+    """Training time (s) of the next evaluation. The moments that the budget allows are evenly spaced in log time.
 
     Args:
-        last: Training time of the moment before, 0 of the first.
-        total: Training time at the end, at which all is evaluated anyway.
-        budget: Seconds that are left to evaluate in; below 0 where they are spent.
-        cost: Seconds that one moment takes.
+        last: Training time of the moment before, s; 0 before the first.
+        total: Training time at the end, s; the run is always evaluated there.
+        budget: Time that is left for evaluation, s; below 0 if more was spent.
+        cost: Time of one evaluation, s.
 
     Returns:
-        Infinity where not even one fits.
+        Infinity if the budget does not allow another moment.
     """
     left = math.floor(budget / cost)
     if left < 1:
@@ -78,27 +78,26 @@ def next_moment(last: float, total: float, budget: float, cost: float) -> float:
 
 
 class ErrorAgainstTime:
-    """Counts the time of training steps alone, and evaluates a run at moments evenly spaced in log time.
+    """Measures the time of training steps, and evaluates a run at moments evenly spaced in log time.
 
-    Each moment adds a row to history.jsonl: scores of `FRAMES` held-out frames, which are the same throughout, area
-    means over squares of pixels where frames are large (`MOST_RAYS`), and of held-out events; the terms of the last
-    loss; and the parts of the last step. Every `STEPS_PER_PREVIEW` steps a picture goes to previews/: a held-out frame
-    beside its render and its depth. All of it takes a share of the training time; at the end all held-out frames are
-    scored. Random numbers stay as they were.
+    Each moment adds a row to history.jsonl: scores of the same `FRAMES` held-out frames, which are reduced if they are
+    large (`MOST_RAYS`), and of held-out events; the losses of the last step; and the time of its parts. Every
+    `STEPS_PER_PREVIEW` steps a picture is stored in previews/: a held-out frame, its render and its depth. At the end
+    all held-out frames are scored. The states of the random generators do not change.
 
     Args:
-        pipeline: That is trained.
-        folder: Of the run.
-        num_steps: Of the whole run.
-        share: Of the training time that evaluation may take; 0: nothing is evaluated, at the end neither.
+        pipeline: Pipeline that is trained.
+        folder: Folder of the run.
+        num_steps: Number of steps of the whole run.
+        share: Largest share of the training time for evaluation. With 0 nothing is evaluated, not even at the end.
     """
 
     def __init__(self, pipeline: EnerfPipeline, folder: Path, num_steps: int, share: float):
         self.pipeline, self.folder, self.num_steps, self.share = pipeline, folder, num_steps, share
         self.seconds = 0.0
-        """Time spent on training steps, without evaluation, checkpoints and the viewer."""
+        """Time (s) of all training steps, without evaluation, checkpoints and the viewer."""
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
-        """Seconds that each evaluation took."""
+        """Seconds of each evaluation, by its kind."""
         self._line = StatusLine()
         self._durations: deque[float] = deque(maxlen=STEPS_MEASURED)
         self._parts: dict[str, float] = {}
@@ -114,15 +113,15 @@ class ErrorAgainstTime:
         self._preview_reduced_by = math.ceil(camera.width / PREVIEW_WIDTH)
 
     def state(self) -> dict[str, Any]:
-        """What a run that goes on has to know, as plain Python values."""
+        """The state for a checkpoint, as plain Python values."""
         return {"seconds": self.seconds, "costs": self.costs}
 
     def begin(self, steps_done: int, state: dict[str, Any] | None) -> None:
-        """Goes on from a step; what a run that went further has recorded after it is removed.
+        """Begins, or continues from a checkpoint. Rows of the history after it are removed.
 
         Args:
-            steps_done: By the run so far.
-            state: Of that time; None: all counts from now on.
+            steps_done: Number of steps up to the checkpoint.
+            state: The state of the checkpoint; None for a new run.
 
         Raises:
             OSError: The history cannot be written.
@@ -133,7 +132,7 @@ class ErrorAgainstTime:
         self._last = rows[-1] if rows else None
         if not self.share:
             return
-        with self._evaluation():  # loads and compiles what scores and pictures need, once
+        with self._evaluation():  # loads and compiles now, so that the first moment takes no longer than others
             dataset = self.pipeline.datamanager.eval_dataset
             if dataset.are_frames:
                 picture = torch.zeros(64, 64, 3)
@@ -147,7 +146,7 @@ class ErrorAgainstTime:
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
-        """Counts the time of the block, a training step; by its parts, where it is the last before a moment."""
+        """Measures the time of the block, a training step, and of its parts if a moment follows it."""
         watch = self.pipeline.stopwatch
         timed = self._is_due or number + 1 == self.num_steps
         begin = time.perf_counter()
@@ -161,11 +160,11 @@ class ErrorAgainstTime:
         self.seconds += self._durations[-1]
 
     def after_step(self, number: int, metrics: dict[str, Tensor]) -> None:
-        """Evaluates what is due, and shows how far training is.
+        """Evaluates if a moment has come, and updates the line of progress.
 
         Args:
-            number: Of the step, from 0.
-            metrics: Of the step.
+            number: Number of the step, from 0.
+            metrics: Metrics of the step.
         """
         done = number + 1
         if "event_correlation" in metrics:
@@ -177,7 +176,7 @@ class ErrorAgainstTime:
             self._line.show(self._status(done))
 
     def finish(self) -> None:
-        """Scores all held-out frames and shows what they have."""
+        """Scores all held-out frames, and prints the last line of progress."""
         clear_line()
         if self.share:
             with self._evaluation():
@@ -206,18 +205,20 @@ class ErrorAgainstTime:
         self._is_due = self.seconds >= next_moment(last, total, budget, self._cost("moments", rays))
 
     def _total(self, done: int) -> float:
-        """Training time of the whole run (s), as far as can be told."""
+        """Predicted training time of the whole run, s."""
         return self.seconds + (self.num_steps - done) * median(self._durations)
 
     def _cost(self, kind: str, rays: int) -> float:
-        """Seconds that an evaluation takes: as long as those before, the first as long as training with its rays."""
+        """Predicted time of an evaluation (s): the mean of earlier ones; for the first, the time to train on its
+        rays."""
         if self.costs[kind]:
             return mean(self.costs[kind])
         return rays * median(self._durations) / self.pipeline.datamanager.get_train_rays_per_batch()
 
     @contextmanager
     def _evaluation(self, kind: str | None = None) -> Iterator[None]:
-        """An evaluation, whose time is counted by its kind; what cannot be written or read is said, once."""
+        """Runs the block as an evaluation, and measures its time. Files that cannot be read or written give one
+        warning."""
         begin, device = time.perf_counter(), torch.device(self.pipeline.device)
         state = random_state(device)
         clear_line()
@@ -227,7 +228,7 @@ class ErrorAgainstTime:
             self._unwritten = False
         except OSError as error:
             if not self._unwritten:
-                say(f"What this run shows could not be stored in {self.folder} ({error.strerror or error}); make room.")
+                say(f"Scores could not be stored in {self.folder} ({error.strerror or error}); make room.")
             self._unwritten = True
         except UserError as error:
             say(f"{error} Training goes on without evaluation.")
@@ -262,7 +263,7 @@ class ErrorAgainstTime:
         append_row(self.folder, self._last)
 
     def _preview(self, done: int) -> None:
-        """Stores the first of the frames that moments look at, its render, aligned by itself, and its depth."""
+        """Stores a picture of the first frame that moments score, its render, aligned alone, and its depth."""
         self.pipeline.eval()
         view = held_out_view(self.pipeline, self._numbers[0], self._preview_reduced_by)
         self.pipeline.train()
@@ -274,7 +275,7 @@ class ErrorAgainstTime:
         write_whole(self.folder / "previews" / f"step-{done:09d}.png", png(torch.cat([shown, depth], dim=1)))
 
     def _status(self, done: int) -> str:
-        """How far training is; the event correlation is that of training pairs, smoothed over some steps."""
+        """The line of progress. Its event correlation is a running mean over training pairs."""
         loss = sum(float(loss) for loss in self.pipeline.last_step.losses.values())
         parts = [f"step {done} of {self.num_steps}", f"loss {loss:.4g}"]
         if self._correlation is not None:

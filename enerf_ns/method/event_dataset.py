@@ -1,4 +1,4 @@
-"""Pictures of a recording for Nerfstudio: its frames, or its events where it has none."""
+"""Pictures of a recording for Nerfstudio: its frames, or pictures of its events if it has no frames."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ class EventDataset(InputDataset):
         """Whether the pictures are frames; otherwise they show events."""
 
     def correct(self, corrections: Corrections) -> None:
-        """Has the recording, and the cameras of the pictures, be as they are with corrected poses and lens; views on a
-        trajectory of their own stay as they are."""
+        """Applies corrections of poses and lens to the recording and to the cameras of the pictures.
+
+        They replace earlier corrections. Held-out views with a trajectory of their own are not corrected.
+        """
         given, frames = self._as_read
         self.recording = corrections.recording(given)
         own = given.held_out_frames
@@ -40,7 +42,7 @@ class EventDataset(InputDataset):
         self.cameras = scene_cameras(self.frames, self.metadata["transform"], self._scale)
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """Picture of shape (height, width, 3): uint8, or float32 in [0, 1] of frames of more than 8 bits."""
+        """A picture of shape (height, width, 3): uint8, or float32 in [0, 1] for frames of more than 8 bits."""
         if not self.are_frames:
             time = int(self.frames.times[image_idx])
             return self.frames.downscaled(event_picture(index_events(self.recording), self.recording.camera, time))
@@ -48,16 +50,16 @@ class EventDataset(InputDataset):
         return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
     def get_image_float32(self, image_idx: int) -> Tensor:
-        """Picture of shape (height, width, 3) in [0, 1]."""
+        """A picture of shape (height, width, 3), float32 in [0, 1]."""
         return torch.from_numpy(brightness(self.get_numpy_image(image_idx)))
 
     def get_image_uint8(self, image_idx: int) -> Tensor:
-        """Picture of shape (height, width, 3)."""
+        """A picture of shape (height, width, 3), uint8."""
         return torch.from_numpy(in_8_bits(self.get_numpy_image(image_idx)))
 
     def get_metadata(self, data: dict) -> dict:
-        """is_frame: whether the picture is a frame. depth, where the recording has it: metres along the optical axis
-        (height, width, 1), 0 where unknown."""
+        """`is_frame`, whether the picture is a frame, and `depth` if the recording has it: metres along the optical
+        axis, shape (height, width, 1), 0 where unknown."""
         metadata: dict = {"is_frame": self.are_frames}
         depth = self.frames.depth(data["image_idx"])
         if depth is not None:

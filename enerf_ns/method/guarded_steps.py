@@ -1,4 +1,4 @@
-"""Steps that are not finite are left out, and a field that renders nothing is told."""
+"""Guards of training steps: steps that are not finite are left out, and a field that renders nothing is found."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Module, Parameter
 
 from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.method.nerfstudio_seams import leave_out_fused_step
 from enerf_ns.method.pipeline import TrainStep
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.event_supervision import brightness_change
@@ -21,23 +22,23 @@ from enerf_ns.supervision.event_supervision import brightness_change
 Seen = TypeVar("Seen")
 
 MOST_SKIPPED = 5
-"""Steps in a row that may be skipped because they are not finite, before training stops."""
+"""Number of steps in a row that are not finite at which training stops."""
 
 LEARNING_CHECKED_EVERY, LEARNING_CHECKED_FROM = 100, 300
-"""Steps between looks at whether anything is learnt, and steps before the first."""
+"""Steps between two checks that the field learns, and the step of the first check."""
 
 NOTHING = 1e-3
-"""Share of the measured change of log brightness, or of a ray, below which a field renders nothing."""
+"""Mean accumulation, or ratio of the rendered to the measured change of log brightness, below which a field renders
+nothing."""
 
 
 class GuardedOptimizers(Optimizers):
-    """Nerfstudio's optimisers, which leave out a step that is not finite, and on a GPU do not wait to hear whether.
+    """Nerfstudio's optimisers, which leave out a step that is not finite. On a GPU they do not wait for that result.
 
     Args:
         config: Optimisers and schedulers by the name of the group of parameters.
         param_groups: Parameters by the name of the group.
-        is_finite: Whether the losses of this step, and the gradients that lie with the parameters, can be followed;
-            a boolean on their device.
+        is_finite: Returns whether the losses and gradients of this step are finite, as a boolean on their device.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class GuardedOptimizers(Optimizers):
         super().__init__(config, param_groups)
         self.is_finite = is_finite
         self.finite: Tensor | None = None
-        """Whether the last step was taken; a boolean on the device."""
+        """Whether the last step was finite, a boolean on the device; None before the first step."""
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         self.finite = self.is_finite()
@@ -54,12 +55,11 @@ class GuardedOptimizers(Optimizers):
         for group in param_groups:
             optimizer = self.optimizers[group]
             gradients = [parameter.grad for parameter in self.parameters[group] if parameter.grad is not None]
-            if grad_scaler.is_enabled():  # which leaves out what is not finite by itself, and must see it
+            if grad_scaler.is_enabled():  # GradScaler leaves out a step by itself if it finds a NaN
                 for gradient in sorted(gradients, key=Tensor.numel)[:1]:
                     gradient.masked_fill_(~self.finite, torch.nan)
             elif optimizer.defaults.get("fused"):
-                optimizer.found_inf = (~self.finite).float()  # type: ignore[attr-defined] - as GradScaler tells it
-                optimizer.grad_scale = None  # type: ignore[attr-defined]
+                leave_out_fused_step(optimizer, ~self.finite)
             elif not self.finite:
                 continue
             taken.append(group)
@@ -67,9 +67,13 @@ class GuardedOptimizers(Optimizers):
 
 
 class Later(Generic[Seen]):
-    """Something that was seen at a step, and a boolean that its device will know.
+    """Data of a step, and a boolean that its device is still computing.
 
-    Asked for a step later, it has come meanwhile, and the next step is on its way to the GPU, which does not idle.
+    Read one step later, the boolean has arrived. The GPU has the next step to work on by then, and does not idle.
+
+    Args:
+        seen: Data of the step.
+        value: Boolean on its device.
     """
 
     def __init__(self, seen: Seen, value: Tensor):
@@ -88,7 +92,7 @@ class Later(Generic[Seen]):
 
 
 def what_is_not_finite(step: TrainStep, model: Module) -> str:
-    """The first loss of a step that is not finite, else the first gradient, in words."""
+    """The name of the first loss of a step that is not finite; else of the first gradient."""
     for name, loss in step.losses.items():
         if not loss.isfinite():
             return name
@@ -99,7 +103,7 @@ def what_is_not_finite(step: TrainStep, model: Module) -> str:
 
 
 def keep_batch(step: TrainStep, number: int, file: Path) -> None:
-    """Stores the batch and the losses of a step, whole or not at all, for `torch.load`.
+    """Stores the batch and the losses of a step, whole or not at all, in a file for `torch.load`.
 
     Raises:
         OSError: The disk is full, or the folder cannot be written to.
@@ -112,11 +116,11 @@ def keep_batch(step: TrainStep, number: int, file: Path) -> None:
 
 @torch.no_grad()
 def why_nothing_is_learnt(step: TrainStep, sensor: SensorModel) -> dict[str, str]:
-    """What a step shows of a field that renders nothing, in words, by reason; empty of a sound one."""
+    """Sentences that say why a field renders nothing, by reason; empty if it renders something."""
     found = {}
     accumulation = float(step.accumulation.mean())
     if accumulation < NOTHING:
-        found["empty"] = f"rays meet no surface anywhere: they are stopped by {accumulation:.1g} of one on average"
+        found["empty"] = f"rays meet no surface, their mean accumulation is {accumulation:.1g}"
     events = step.batch.events
     if events is not None:
         start, end, _ = step.batch.split(step.rgb)
@@ -125,5 +129,5 @@ def why_nothing_is_learnt(step: TrainStep, sensor: SensorModel) -> dict[str, str
         measured = sensor.measured_change(events)[fired]
         ratio = float(change.square().mean().sqrt() / measured.square().mean().sqrt())
         if ratio < NOTHING:
-            found["constant"] = f"the rendered change of log brightness is {ratio:.1g} of the measured one"
+            found["constant"] = f"rendered changes of log brightness are {ratio:.1g} times the measured changes"
     return found

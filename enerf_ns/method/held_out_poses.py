@@ -1,4 +1,4 @@
-"""How far held-out views lie from the poses that training looked from."""
+"""The distance of held-out views from the poses of the training."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from enerf_ns.method.datamanager import EnerfDataManager
 
 CLOSE = 0.01
-"""How far a held-out view of a trajectory of its own may be from a pose of the training to be on its path: the distance
-as a share of the view's depth and the angle in radians together, about the part of the focal length by which its
-picture differs."""
+"""Largest difference of a held-out view on a trajectory of its own from a pose of the training, to be on its path. It
+is the distance as a share of the view's depth plus the angle in radians: about the shift of the picture as a share of
+the focal length."""
 
 INSTANTS = 1000
-"""Poses along the trajectory of the events that held-out views are compared with."""
+"""Number of poses along the trajectory of the events with which held-out views are compared."""
 
 
 def nearest_poses(
@@ -25,14 +25,14 @@ def nearest_poses(
     training: Float64[np.ndarray, "poses 3 4"],
     depths: Float64[np.ndarray, " views"],
 ) -> tuple[Float64[np.ndarray, " views"], Float64[np.ndarray, " views"]]:
-    """Distance (metres) and angle (radians) of each held-out view to its nearest pose of the training.
+    """Distance (metres) and angle (radians) of each held-out view to the nearest pose of the training.
 
-    That with the least sum of the distance as a share of the view's depth, and the angle.
+    The nearest pose has the least sum of the distance, as a share of the view's depth, and the angle.
 
     Args:
-        held_out: Camera to world, metres.
-        training: Camera to world, metres.
-        depths: Of what the held-out views see, metres.
+        held_out: Poses of the views, camera to world, metres.
+        training: Poses of the training, camera to world, metres.
+        depths: Median depth of each held-out view, metres.
     """
     distances = np.linalg.norm(held_out[:, None, :, 3] - training[None, :, :, 3], axis=-1)
     angles = rotation_angles(held_out[:, None, :, :3], training[None, :, :, :3])
@@ -43,7 +43,7 @@ def nearest_poses(
 def rotation_angles(
     first: Float64[np.ndarray, "*batch 3 3"], second: Float64[np.ndarray, "*batch 3 3"]
 ) -> Float64[np.ndarray, "*batch"]:
-    """Angle (radians) between two rotations, precise also where it is small: their difference has the norm
+    """Angle (radians) between two rotations, precise for small angles too: the norm of their difference is
     sqrt(8) sin(angle / 2)."""
     apart = np.linalg.norm(first - second, axis=(-2, -1))
     return 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0))
@@ -54,15 +54,15 @@ def on_path(
     spans: Int64[np.ndarray, "spans 2"],
     differences: Float64[np.ndarray, " views"],
 ) -> Bool[np.ndarray, " views"]:
-    """Which held-out views lie among the poses of the training.
+    """Whether each held-out view lies on the path of the training.
 
-    Those of its clock that lie in one of its spans of time, whose cameras moved along the same path; and of any
-    trajectory those that are `CLOSE`.
+    A view on the clock of the training does so if its time is in a span of the training. Any view does so if its
+    difference from the nearest pose is at most `CLOSE`.
 
     Args:
-        times: Of the views, ns; None if they are on a clock of their own.
-        spans: First and last instant of what was learnt from, ns.
-        differences: Distance to the nearest pose as a share of the depth, and angle in radians, together.
+        times: Times of the views, ns; None if they have a clock of their own.
+        spans: First and last instant of each span of the training, ns.
+        differences: Distance to the nearest pose, as a share of the depth, plus the angle in radians.
     """
     close = differences <= CLOSE
     if times is None:
@@ -73,12 +73,12 @@ def on_path(
 def held_out_numbers(
     manager: EnerfDataManager, chosen: Int64[np.ndarray, " views"], depths: Float64[np.ndarray, " views"]
 ) -> dict[str, float]:
-    """How new the held-out views are to the training.
+    """Numbers that say how far the held-out views are from the training.
 
     Args:
-        manager: With held-out frames.
+        manager: Data manager of a recording with held-out frames.
         chosen: Numbers of the held-out frames, from 0.
-        depths: Median depth of each, metres.
+        depths: Median depth of each of them, metres.
 
     Returns:
         held_out_on_path, how many are `on_path`; and means over them of held_out_distance (metres),

@@ -1,4 +1,4 @@
-"""Held-out frames rendered by a run, and numbers about them."""
+"""Held-out frames that a run renders, and numbers about them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from enerf_ns.sensor.sensor_model import SensorModel
 
 
 class RenderingPipeline(Protocol):
-    """What is asked of a pipeline: those of this package have it all."""
+    """The part of a pipeline that rendering held-out frames needs. Pipelines of this package have it."""
 
     datamanager: EnerfDataManager
 
@@ -47,13 +47,13 @@ class RenderingPipeline(Protocol):
 
 @torch.no_grad()
 def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> HeldOutView:
-    """Render one held-out frame, its brightness as it is.
+    """Renders one held-out frame. Its brightness is not aligned.
 
     Args:
-        pipeline: With a trained field, as in evaluation.
-        number: Of the held-out frame, from 0.
-        reduced_by: Pixels along the squares that one pixel of the view stands for: the frame is their mean, its depth
-            is unknown where that of any of them is, and rays go through their middles.
+        pipeline: Pipeline with a trained field, in evaluation mode.
+        number: Number of the held-out frame, from 0.
+        reduced_by: Side of the square of pixels that becomes one pixel of the view. The frame is averaged over it,
+            depth is unknown if it is unknown at any of its pixels, and the ray goes through its middle.
     """
     manager = pipeline.datamanager
     dataset, metres = manager.eval_dataset, 1.0 / manager.train_dataparser_outputs.dataparser_scale
@@ -81,18 +81,19 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
 def held_out_views(
     pipeline: RenderingPipeline, numbers: Sequence[int] | None = None, reduced_by: int = 1, evidence: bool = True
 ) -> tuple[list[HeldOutView], dict[str, Score]]:
-    """Render held-out frames.
+    """Renders held-out frames.
 
     Args:
-        pipeline: With a trained field.
-        numbers: Of the held-out frames, from 0. None: all, with a bar that shows how far it is.
-        reduced_by: As of `held_out_view`.
-        evidence: Find out how far depth is known, and spread it from there, which takes longer than rendering.
+        pipeline: Pipeline with a trained field.
+        numbers: Numbers of the held-out frames, from 0. Default: all frames, with a progress bar.
+        reduced_by: Side of the square of pixels that becomes one pixel, as in `held_out_view`.
+        evidence: Compute the confidence in depth, and spread depth from confident pixels, which takes longer than
+            rendering.
 
     Returns:
-        The views, and numbers about the whole set: rendering speed, and the `held_out_numbers`, and where a run learnt
-        from events whose thresholds the recording states, `EXPECTED_SCALE`, the `expected_brightness_scale`;
-        for a recording without frames, the correlation of its events, or why there is none.
+        The views, and numbers about all of them: the speed of rendering, the `held_out_numbers`, and
+        `expected_brightness_scale` as `EXPECTED_SCALE` if the run learnt from events and the recording states their
+        thresholds. For a recording without frames, there are the scores of its events instead.
     """
     pipeline.eval()
     manager = pipeline.datamanager
@@ -122,8 +123,10 @@ def held_out_views(
 
 
 def scores_at_stated_poses(pipeline: RenderingPipeline) -> dict[str, float]:
-    """psnr, ssim and event_correlation of a run at the poses of its recording as they were stated, where they were
-    corrected: what correcting them is worth. Those that there are."""
+    """psnr, ssim and event_correlation of a run at the stated poses of its recording, without the corrections.
+
+    The difference shows the benefit of the corrections. Scores without a value are left out.
+    """
     manager = pipeline.datamanager
     corrected = manager.corrections
     manager.correct(Corrections())
@@ -139,21 +142,21 @@ def scores_at_stated_poses(pipeline: RenderingPipeline) -> dict[str, float]:
 
 
 def expected_brightness_scale(contrast_thresholds: tuple[float, float], sensor: SensorModel) -> float:
-    """What the scale of the fit of log-affine-set is for a field that explains all events.
+    """The scale that the protocol log-affine-set fits to a field that explains all events.
 
-    Events count changes of log brightness in thresholds, so that the field has its contrast in those that it learnt
-    with: with too high ones it shows too much, which the fit takes back.
+    Events count changes of log brightness in contrast thresholds. A field that learns with thresholds that are too high
+    has too much contrast, which the fitted scale reduces.
 
     Args:
         contrast_thresholds: C_on and C_off of the sensor that made the events.
-        sensor: The one that the field learnt with.
+        sensor: Model of the sensor with which the field learnt.
     """
     encoding = sensor.response.exponent if isinstance(sensor.response, Gamma) else 1.0
     return encoding * 0.5 * sum(contrast_thresholds) / float(sensor.mean_threshold)
 
 
 def _rays(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> RayBundle:
-    """Rays of a held-out frame, shape (height, width), as of `held_out_view`."""
+    """Rays of a held-out frame, shape (height, width), for `held_out_view`."""
     camera = pipeline.datamanager.eval_dataset.cameras[number : number + 1].to(pipeline.device)
     if reduced_by > 1:
         size = camera.height // reduced_by, camera.width // reduced_by
@@ -163,12 +166,12 @@ def _rays(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> RayB
 
 
 def _with_evidence(pipeline: RenderingPipeline, view: HeldOutView, number: int, reduced_by: int) -> HeldOutView:
-    """The view with how far its depth is known, and with its depth spread from there."""
+    """The view with its confidence in depth, and with depth spread from confident pixels."""
     rays, scale = _rays(pipeline, number, reduced_by), pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     confidence, spread = depth_evidence(pipeline.model, rays, view.depth, view.rendered, scale)
     return replace(view, confidence=confidence, spread_depth=spread)
 
 
 def _reduced(picture: Tensor, by: int) -> Tensor:
-    """Means over squares of pixels of a picture (height, width, channels); rows and columns left over are cut off."""
+    """Means over squares of pixels of a picture (height, width, channels). Rows and columns left over are cut off."""
     return torch.nn.functional.avg_pool2d(picture.movedim(-1, 0), by).movedim(0, -1) if by > 1 else picture

@@ -1,4 +1,5 @@
-"""Steps that are larger than the memory: what one keeps is measured beforehand, and the field is asked in parts."""
+"""Training steps that are larger than the memory: their need is measured beforehand, and the field is evaluated in
+parts."""
 
 from __future__ import annotations
 
@@ -16,38 +17,38 @@ from torch.utils.checkpoint import checkpoint
 from enerf_ns.method.stopwatch import seconds_of
 
 SHARE = 0.8
-"""Of the free memory that a step may fill."""
+"""Fraction of the free memory that one training step may use."""
 
 SMALL_STEP = 2**20
-"""Samples of the field that fit any memory, and take no more than seconds."""
+"""Number of samples of a step that fits any memory, and takes no more than seconds."""
 
 PROBE_SAMPLES = 2**15
-"""Samples, at the least, of the rays at which a step is measured."""
+"""Least number of samples of the rays with which a step is measured."""
 
 
 @dataclass(frozen=True)
 class StepCost:
-    """What a training step takes."""
+    """Memory and time of a training step."""
 
     bytes: float
-    """That it keeps for its backward pass."""
+    """Memory that the step keeps for its backward pass."""
     field_bytes: float
-    """Of these, what the field keeps, which may be asked in parts."""
+    """The part of `bytes` that the field keeps, which can be evaluated in parts."""
     seconds: float
-    """Of rendering, forward and backward."""
+    """Time of rendering, forward and backward."""
     num_samples: int
-    """Of the field, in all."""
+    """Number of samples at which the field is evaluated."""
 
     def samples_at_once(self, free: int) -> int | None:
-        """Samples that the field may be asked at once, so that a step fits.
+        """Largest number of samples at which the field can be evaluated at once, so that a step fits the memory.
 
         Args:
-            free: Bytes of memory.
+            free: Free memory in bytes.
 
         Returns:
-            None where all of them may; 0 where a step does not fit with a single one.
+            None if all samples fit; 0 if a step does not fit even with a single sample.
         """
-        # a part that goes through the backward pass has gradients as large as what it kept
+        # in the backward pass, a part has gradients as large as what it kept
         room, others = SHARE * free, self.bytes - self.field_bytes
         if 2 * self.bytes <= room:
             return None
@@ -55,7 +56,7 @@ class StepCost:
 
 
 def free_bytes(device: torch.device | str) -> int:
-    """Memory that is free on a device, in bytes."""
+    """Free memory of a device, in bytes."""
     if torch.device(device).type != "cuda":
         return psutil.virtual_memory().available
     free, _ = torch.cuda.mem_get_info(device)
@@ -63,8 +64,8 @@ def free_bytes(device: torch.device | str) -> int:
 
 
 def kept_bytes(call: Callable[[], Any], model: Model) -> int:
-    """Bytes of the tensors that a call keeps for its backward pass, each storage counted once; without the parameters
-    and buffers of the model."""
+    """Bytes of the tensors that a call keeps for its backward pass, without parameters and buffers of the model. Each
+    storage counts once."""
     kept: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -88,7 +89,7 @@ def rays_from_the_middle(model: Model, num_rays: int) -> RayBundle:
 
 
 def forward_and_backward(model: Model, rays: RayBundle) -> None:
-    """Renders rays as in training, and finds the gradients of all parameters, which it throws away."""
+    """Renders rays as in training, and computes the gradients of all parameters without keeping them."""
     outputs: Any = model.get_outputs(rays)
     loss = outputs["rgb"].sum() + outputs["accumulation"].sum()
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -96,13 +97,13 @@ def forward_and_backward(model: Model, rays: RayBundle) -> None:
 
 
 def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
-    """What a training step takes, from rendering some rays out of the middle of the scene.
+    """Memory and time of a training step, extrapolated from rendering some rays from the middle of the scene.
 
     Args:
-        model: On its device, with a field that is asked for all samples at once. Neither its parameters nor the state
-            of the random generators change.
-        num_rays: Of a step.
-        num_samples: Of the field along a ray.
+        model: Model on its device, whose field is evaluated at all samples at once. Neither its parameters nor the
+            states of the random generators change.
+        num_rays: Rays of a step.
+        num_samples: Samples of the field along a ray.
     """
     device = model.scene_box.aabb.device
     devices = [device] if device.type == "cuda" else []
@@ -125,15 +126,15 @@ def step_cost(model: Model, num_rays: int, num_samples: int) -> StepCost:
 def in_parts(
     field: Callable[[RaySamples], dict[Any, Tensor]], samples: RaySamples, samples_at_once: int | None
 ) -> dict[Any, Tensor]:
-    """What a field says of samples, asked for some at once: the same values and gradients, in less memory.
+    """Outputs of a field at samples, evaluated in parts: the same values and gradients, in less memory.
 
-    What a part keeps for its backward pass is thrown away and computed again when that comes (Chen et al., Training
-    Deep Nets with Sublinear Memory Cost, 2016).
+    A part keeps nothing for its backward pass, but is computed again there (Chen et al., Training Deep Nets with
+    Sublinear Memory Cost, 2016).
 
     Args:
-        field: Takes each sample by itself.
-        samples: Shape (rays, samples a ray).
-        samples_at_once: At least those of one ray are. None: all.
+        field: A function that computes each sample independently.
+        samples: Samples of shape (rays, samples per ray).
+        samples_at_once: Largest number of samples of a part, which has at least one ray; None for all samples.
     """
     assert samples.shape is not None
     rays, samples_a_ray = samples.shape

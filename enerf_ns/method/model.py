@@ -14,7 +14,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import interlevel_loss, ray_samples_to_sdist
-from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
+from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer
 from nerfstudio.model_components.scene_colliders import AABBBoxCollider, NearFarCollider
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
@@ -45,96 +45,102 @@ from enerf_ns.supervision.frame_exposure import FrameExposure
 from enerf_ns.supervision.losses import distortion_loss, frame_loss
 
 FAINT = 5e-4
-"""Share of a ray's light that a picture may miss for what lies behind, and as much for what is thin."""
+"""Part of the accumulation of a ray that a picture may lack: so much behind the last sample that is rendered, and as
+much in samples of low weight."""
 
 AROUND_DEPTH = 0.05
-"""How far from a ray's depth its light may come from to speak for it, as a share of the depth. Of shares of 2, 5 and
-10 %, this one tells depths that are right within 5 % best from others."""
+"""Largest distance between a sample and the ray's depth at which the sample's weight counts as confidence, as a share
+of the depth. Of shares of 2, 5 and 10 %, this one separates depths that are right within 5 % best from others."""
 
 FAR_SHARE = 0.75
-"""Share of a ray's light that comes from nearer than its far depth."""
-
+"""Part of the accumulation of a ray that lies nearer than its far depth."""
 
 FARTHEST = 1000.0
-"""Where rays end that go on beyond the box, in scene units: halves of its longest side."""
+"""Far end of the rays where space is contracted, in scene units (halves of the longest side of the box)."""
 
 
 @dataclass
 class EnerfModelConfig(ModelConfig):
-    """E-NeRF. What is None is chosen from the recording when training starts, and stored in config.yml."""
+    """E-NeRF. Fields that are None are filled in from the recording when training starts, and stored in config.yml."""
 
     _target: Type = field(default_factory=lambda: EnerfModel)  # noqa: UP006
     num_levels: Optional[int] = None  # noqa: UP045
-    """Levels of the hash grid. None: so many that each is at least 1.4 times as fine as the one before, at most 10."""
+    """Levels of the hash grid. Default: the largest number up to 10 at which each level is at least 1.4 times as fine
+    as the level before it."""
     base_res: int = 16
     """Cells along the box at the coarsest level of the hash grid."""
     max_res: Optional[int] = None  # noqa: UP045
-    """Cells along the box at the finest level of the hash grid. None: as fine as the sensor's pixels on the scene."""
+    """Cells along the box at the finest level of the hash grid. Default: cells as large as a pixel of the sensor on the
+    scene."""
     log2_table_size: int = 17
     """Base-2 logarithm of the entries of each level of the hash grid."""
     hash_grid: str = "auto"
-    """What computes the hash grid: triton (a GPU), numba (a CPU), torch (any device, slow), or the fastest that fits
-    (auto). Results are the same but for rounding, and so are checkpoints."""
+    """Backend that computes the hash grid: triton (GPU), numba (CPU), torch (any device, slow), or auto, the fastest
+    that fits the device. Results differ by rounding alone, and checkpoints fit all backends."""
     hidden_dim: int = 32
     """Width of the density network."""
-    hidden_dim_colour: Annotated[int, tyro.conf.arg(aliases=["--pipeline.model.hidden-dim-color"])] = 32
+    hidden_dim_colour: int = 32
     """Width of the colour network."""
     num_features: int = 15
-    """Numbers that the density network tells the colour network."""
+    """Number of features that the density network passes to the colour network."""
     view_direction: Optional[bool] = None  # noqa: UP045
-    """Let brightness depend on the viewing direction, for shiny scenes that are seen from many sides. None: where the
-    camera goes around the scene and a short training shows that it helps."""
+    """Let brightness depend on the viewing direction, for shiny scenes that are seen from many sides. Default: True
+    where the camera moves around the scene and a short training shows that it helps."""
     brightness: Optional[Literal["log-sigmoid", "sigmoid", "exponential"]] = None  # noqa: UP045
-    """What the colour network's output spans evenly: log brightness between limits, brightness as in the paper, or log
-    brightness without an upper limit, for scenes of high dynamic range. None: within limits where the events fit."""
+    """Function from the output of the colour network to brightness: log brightness between two limits (log-sigmoid),
+    brightness from 0 to 1 as in the paper (sigmoid), or log brightness without an upper limit, for scenes of high
+    dynamic range (exponential). Default: log-sigmoid where the events fit between the limits, else exponential."""
     num_channels: Optional[Literal[1, 3]] = None  # noqa: UP045
-    """Colour channels. None: 3 where the field learns from colour, of events or of frames, else 1."""
+    """Colour channels of the field. Default: 3 where the field learns from colour events or colour frames, else 1."""
     sampling: Optional[Literal["proposal", "uniform"]] = None  # noqa: UP045
-    """Where samples along a ray lie: where a small network expects surfaces, or everywhere. None: where it does."""
+    """Places of the samples along a ray: where a small network expects surfaces (proposal), or at even distances
+    (uniform). Default: proposal."""
     num_proposal_samples: int = 48
-    """Samples of the proposal network along a ray."""
+    """Samples along a ray at which the proposal network is evaluated."""
     num_samples: int = 24
-    """Samples of the field along a ray."""
+    """Samples along a ray at which the field is evaluated."""
     sensor: Annotated[SensorModelConfig, tyro.conf.arg(name="")] = field(default_factory=SensorModelConfig)
     event_loss: Optional[str] = None  # noqa: UP045
-    """Compare changes of brightness in units of the threshold, robustly (huber) or squared as in the paper (squared),
-    or up to scale (normalised). None: huber, squared for enerf-paper, or as the preset."""
+    """Loss on the rendered change of log brightness of a pair of events, in units of the contrast threshold: robust
+    (huber), squared as in the paper (squared), or independent of scale (normalised). Default: huber; squared for
+    enerf-paper; with a preset, the loss of the preset."""
     event_loss_weight: float = 1.0
     """Weight of the event loss."""
     no_event_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the loss on silent pixels (see datamanager.silent-pairs). None: 0.1, or as the paper for
-    enerf-paper."""
+    """Weight of the loss on silent pixels (see datamanager.silent-pairs). Default: 0.1; for enerf-paper, the weight of
+    the paper."""
     no_event_margin: Optional[float] = None  # noqa: UP045
-    """Share of the threshold that a silent pixel may change at no cost: 1 as in the paper, 0 for total variation. None:
-    0, or as the paper for enerf-paper."""
+    """Change of a silent pixel that costs nothing, as a share of the contrast threshold: 1 as in the paper, 0 for total
+    variation. Default: 0; for enerf-paper, 1."""
     frame_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the loss on frames. None: 10; beside events, as the errors of both make it (`ErrorBalance`)."""
+    """Weight of the loss on frames. Default: 10 with frames alone; with events and frames, the weight that balances
+    their errors (`ErrorBalance`)."""
     learn_exposure: Optional[bool] = None  # noqa: UP045
-    """Learn a gain and an offset of each frame. None: beside events, where pixels that saw no event between two frames
-    tell that the exposure changed."""
+    """Learn a gain and an offset of each frame. Default: True with events and frames, where pixels without an event
+    between two frames changed, which shows that the exposure changed."""
     level_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the squared difference between the mean log brightness of a batch and that of mean-brightness. None:
-    0.1 where the field learns from events alone, which leave the level of brightness open, else 0."""
+    """Weight of the squared difference between the mean log brightness of a batch and the logarithm of mean-brightness.
+    Default: 0.1 where the field learns from events alone, which do not determine the level of brightness, else 0."""
     mean_brightness: Optional[float] = None  # noqa: UP045
-    """Geometric mean of brightness, of what is 1 in a frame that is white, near which a field is held that learns from
-    events alone. None: that of frames of the same camera, or `MEAN_BRIGHTNESS` where there are none."""
+    """Geometric mean of the brightness of the scene, where white is 1. A field that learns from events alone is held
+    near it. Default: the mean of the frames of the same camera, or `MEAN_BRIGHTNESS` where there are no frames."""
     opacity_loss_weight: Optional[float] = None  # noqa: UP045
-    """Weight of the share of each ray that no surface stops; 0 for an object before nothing. None: 0 where the sensor's
-    border is silent, else 1."""
+    """Weight of the light that passes through the scene, 1 minus accumulation; 0 for an object before an empty
+    background. Default: 0 where the border of the sensor is silent, else 1."""
     distortion_loss_weight: float = 0.01
-    """Weight of the distortion loss of mip-NeRF 360, which gathers fog into surfaces."""
+    """Weight of the distortion loss of mip-NeRF 360, which contracts fog to surfaces."""
     interlevel_loss_weight: float = 1.0
-    """Weight of the loss by which the proposal network learns."""
+    """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     init_density: float = 1.0
-    """Density before training, in 1 / scene unit. A field that starts transparent first draws a negative of the scene,
-    by its holes before the bright background."""
+    """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
+    holes in fog before a bright background."""
     contraction: Optional[bool] = None  # noqa: UP045
-    """Contract the space beyond the box towards infinity, as mip-NeRF 360 does; without it nothing lies there. None:
-    where a share of the events comes from beyond the box."""
+    """Contract the space beyond the box, out to infinity, as mip-NeRF 360 does. Without contraction the space beyond
+    the box is empty. Default: True where a share of the events comes from beyond the box."""
     near_plane: Optional[float] = None  # noqa: UP045
-    """Nearest distance of a sample from the camera, in scene units. None: the near end of the recording's depths."""
+    """Nearest distance of a sample from the camera, in scene units. Default: the near end of the recording's depths."""
 
-    # What Nerfstudio's own models have, and this one has no use for, is no flag.
+    # fixed, so that they are no flags: this model does not read them
     enable_collider: Fixed[bool] = True
     collider_params: Fixed[Optional[Dict[str, float]]] = field(  # noqa: UP006, UP045
         default_factory=lambda: {"near_plane": 2.0, "far_plane": 6.0}
@@ -142,25 +148,13 @@ class EnerfModelConfig(ModelConfig):
     loss_coefficients: Fixed[Dict[str, float]] = field(default_factory=dict)  # noqa: UP006
     prompt: Fixed[Optional[str]] = None  # noqa: UP045
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before the sensor had a config of its own, before contraction, before fields
-        started half opaque, and before the level of brightness could be stated, too."""
-        thresholds = state.pop("contrast_thresholds", None)
-        if "sensor" not in state:
-            state["sensor"] = SensorModelConfig(contrast_thresholds=thresholds, response="linlog")
-        if "hidden_dim_color" in state:
-            state["hidden_dim_colour"] = state.pop("hidden_dim_color")
-        before = {"contraction": False, "init_density": 0.01, "level_loss_weight": 0.0}
-        before["mean_brightness"] = MEAN_BRIGHTNESS
-        self.__dict__.update({**before, **state})
-
 
 class BoxCollider(AABBBoxCollider):
-    """Starts and ends rays at the scene box, and never nearer than the near plane, in training and rendering alike.
+    """Sets the near and far ends of rays to the scene box, and never nearer than the near plane.
 
-    Nerfstudio's own forgets the near plane when rendering and so shows space that training never saw. Rays that say
-    themselves where they start and end, as those of a crop do, start and end there, within the box. Rays that miss the
-    box, or only graze it, are as good as without length.
+    Nerfstudio's own collider ignores the near plane in evaluation, and so shows space that training never saw. Rays
+    that have ends already, as the rays of a crop, keep the part of them that is in the box. A ray that misses or grazes
+    the box gets a length of 1e-4 scene units.
     """
 
     def forward(self, ray_bundle: RayBundle) -> RayBundle:
@@ -177,7 +171,7 @@ class BoxCollider(AABBBoxCollider):
 
 
 class Outputs(dict[str, Any]):
-    """What rays show, by name; what is a function is called when it is first asked for, by its name."""
+    """Outputs of a render by name. A value that is a function is computed when it is first read by its name."""
 
     def __getitem__(self, name: str) -> Tensor:
         value: Any = super().__getitem__(name)
@@ -191,9 +185,9 @@ class EnerfModel(Model):
 
     config: EnerfModelConfig
     samples_at_once: int | None = None
-    """Samples that the field is asked at once; None: all (`enerf_ns.method.memory`)."""
+    """Largest number of samples at which the field is evaluated at once; None for all (`enerf_ns.method.memory`)."""
     seen_volume: Callable[[], SeenVolume] | None = None
-    """Where the events that are learnt from came from; None where there are none, as of a model by itself."""
+    """Returns the volume that the camera of the events saw; None for a model without a recording."""
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -236,15 +230,15 @@ class EnerfModel(Model):
             init_density=config.init_density,
             backend=config.hash_grid,
         )
-        # a field has its own level, near which it starts: held elsewhere, slider_depth came out 1.3 dB worse
+        # a field starts near a level of its own: without this gain, slider_depth was 1.3 dB worse at another level
         self.gain: float = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
-        # what has no upper end shines through anything
+        # unbounded brightness leaks through any residual transmittance, so that no light may be dropped
         self._faint = 0.0 if config.brightness == "exponential" else FAINT
         first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
         self.proposal = self.expected = None
         if config.sampling == "proposal":
-            # may be half: it only places samples, and moves changes of log brightness by a fifth (bfloat16) or a
-            # thirtieth (float16) of what their jitter does
+            # may run in half precision, since it only places samples: that moves changes of log brightness by a fifth
+            # (bfloat16) or a thirtieth (float16) of what the jitter of the samples does
             self.proposal = HashDensity(
                 aabb,
                 num_levels=5,
@@ -262,7 +256,6 @@ class EnerfModel(Model):
             self.expected = DensityVoxels(self.proposal)
         else:
             self.sampler = first_sampler(num_samples=config.num_samples)
-        self.renderer_rgb = RGBRenderer(background_color="random")
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
 
@@ -286,16 +279,18 @@ class EnerfModel(Model):
         ]
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Render rays.
+        """Renders rays.
 
         Args:
             ray_bundle: Any rays; in training usually a `PairedRayBundle`.
 
         Returns:
-            rgb (rays, 3), at most `gain` but where brightness is exponential, and accumulation (rays, 1). In training
-            rgb has the channels of the field, and with it comes what the losses need; otherwise depth (rays, 1) in
-            scene units along the ray, and normals (rays, 3) mapped from [-1, 1] to [0, 1] and confidence (rays, 1) of
-            `depth_evidence`, which are computed when they are asked for, by their name.
+            rgb, shape (rays, 3), at most `gain` unless brightness is exponential, and accumulation, shape (rays, 1).
+
+            In training rgb has the channels of the field, and weights_list and ray_samples_list are there for the
+            losses. In evaluation there are depth, shape (rays, 1), in scene units along the ray; normals, shape
+            (rays, 3), mapped from [-1, 1] to [0, 1]; and confidence, shape (rays, 1), of `depth_evidence`. Normals and
+            confidence are computed when they are read.
         """
         if ray_bundle.nears is None:
             ray_bundle = self.collider(ray_bundle)
@@ -315,14 +310,17 @@ class EnerfModel(Model):
         }
 
     def _samples(self, rays: RayBundle) -> tuple[RaySamples, list[Tensor], list[RaySamples]]:
-        """Samples along rays, and weights and samples of the proposal network, or of its voxels but in training."""
+        """Samples along rays, and the weights and samples of the proposal network; in evaluation, of its voxels."""
         if self.proposal is None:
             return self.sampler(rays), [], []
         return self.sampler(rays, density_fns=[self.proposal.density_fn if self.training else self.expected])
 
     def _picture(self, rays: RayBundle) -> Outputs:
-        """What rays show, from the camera on until hardly any light is left, and the colour only of what it comes
-        from."""
+        """Outputs of rays in evaluation.
+
+        Samples are rendered from the camera on, until the transmittance is below `FAINT`. Colour is computed only for
+        samples whose weight counts.
+        """
         grid = self.field.geometry.grid
         if backend_of(grid.backend, rays.origins, grid.table) == "numba" and not torch.is_grad_enabled():
             from enerf_ns.rendering.front_to_back_numba import render  # here, since Numba may be missing
@@ -347,8 +345,8 @@ class EnerfModel(Model):
         )
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Outputs:
-        """What the rays of a picture show, each of shape (height, width, its size); normals and confidence where they
-        are asked for, by their name."""
+        """Outputs of the rays of a picture, each of shape (height, width, channels). Normals and confidence are
+        computed when they are read."""
         outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
 
         def normals() -> Tensor:
@@ -363,17 +361,17 @@ class EnerfModel(Model):
 
     @torch.no_grad()
     def depth_evidence(self, rays: RayBundle, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the depth of rays is known, and how far away their surfaces may be where it is not.
+        """Confidence in the depth of rays, and their far depth.
 
         Args:
-            rays: Of any shape.
-            depth: Of the rays, shape (*batch, 1), scene units along the ray.
+            rays: Rays of any shape.
+            depth: Depth of the rays, shape (*batch, 1), in scene units along the ray.
 
         Returns:
-            The confidence in the depth, from 0 to 1: the share of a ray's light that comes from within `AROUND_DEPTH`
-            of it, times the evidence of the events that came from there (`SeenVolume.evidence`; beyond the scene box
-            there is none); and the far depth, in scene units along the ray, nearer than which `FAR_SHARE` of the light
-            comes from. Both have the shape of depth, and are on its device.
+            Two tensors of the shape and on the device of `depth`. The confidence, from 0 to 1, is the weight of the
+            samples within `AROUND_DEPTH` of the depth, times the evidence of the events from there
+            (`SeenVolume.evidence`, 0 beyond the scene box). The far depth, in scene units along the ray, is the depth
+            before which `FAR_SHARE` of the accumulation lies.
         """
         volume = self.seen_volume() if self.seen_volume else None
         size, confidence, far = self.config.eval_num_rays_per_chunk, [], []
@@ -394,9 +392,10 @@ class EnerfModel(Model):
 
     @torch.no_grad()
     def normals(self, points: Tensor) -> Tensor:
-        """Surface normals at points (rays, 3), mapped to [0, 1]: the direction in which density falls fastest.
+        """Surface normals at points, shape (rays, 3), mapped to [0, 1]: the directions in which density falls fastest.
 
-        Differences of log density over the corners of a tetrahedron as wide as two cells of the finest level.
+        They are differences of log density between the corners of a tetrahedron that is as wide as two cells of the
+        finest level.
         """
         assert self.config.max_res is not None
         corners = points.new_tensor([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -408,11 +407,11 @@ class EnerfModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: TrainBatch, metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """All losses, with their weights, of what `get_outputs` made of the rays of a batch."""
+        """All losses, with their weights, of the outputs that `get_outputs` made of the rays of a batch."""
         config = self.config
         start, end, frames = batch.split(outputs["rgb"])
         losses: dict[str, Tensor] = {}
-        share: Tensor | float = 1.0  # of the pairs of events, beside those of any instants
+        share: Tensor | float = 1.0  # weight of the pairs of events; pairs of any instants have the rest
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
             if "event_loss" in losses and "instant_loss" in losses:
@@ -447,7 +446,7 @@ class EnerfModel(Model):
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Any], batch: TrainBatch) -> dict[str, Tensor]:
-        """event_correlation and frame_psnr (dB), each where the batch has it."""
+        """event_correlation where the batch has events, and frame_psnr (dB) where it has frames."""
         start, end, frames = batch.split(outputs["rgb"])
         metrics: dict[str, Tensor] = {}
         if batch.events is not None:
@@ -459,19 +458,15 @@ class EnerfModel(Model):
     def _frame_loss(self, rendered: Tensor, frames: FrameBatch) -> Tensor:
         if self.exposure is not None:
             rendered = self.exposure(rendered, frames.indices[:, 0])
-        return frame_loss(rendered, frames.colours, grey=self.is_grey or frames.are_grey)
-
-    @property
-    def is_grey(self) -> bool:
-        """Whether the field has one channel."""
-        return self.config.num_channels == 1
+        return frame_loss(rendered, frames.colours, grey=self.config.num_channels == 1 or frames.are_grey)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Scores of one picture, its brightness aligned by itself; `ns-eval` aligns all held-out frames at once.
+        """psnr and ssim of one picture, and pictures of it.
 
-        A picture of events has no scores, nor has one that cannot be aligned.
+        The brightness of this picture alone is aligned; `ns-eval` aligns all held-out frames together. There are no
+        scores for a picture of events, nor for a picture that cannot be aligned.
         """
         recorded, rendered = batch["image"].to(outputs["rgb"].device)[..., :3], outputs["rgb"]
         scores: dict[str, float] = {}
@@ -489,7 +484,8 @@ class EnerfModel(Model):
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """What the viewer and ns-render show of a camera: above 1 brightness is white, where it would wrap round."""
+        """Outputs of a camera for the viewer and ns-render. Brightness is clipped to 1, since their conversion to 8
+        bits would wrap round."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
         outputs["rgb"] = outputs["rgb"].clamp(max=1.0)
         return outputs
@@ -498,11 +494,10 @@ class EnerfModel(Model):
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
-        """Always strict: parameters that do not fit are an error, never a silently random field.
+        """Loads parameters, always strictly: Nerfstudio's pipeline tries once more without, and a field would be random
+        in silence.
 
-        Checkpoints of earlier versions spell colour_network another way, and have no errors of pairs of any instants.
+        Raises:
+            RuntimeError: The parameters are of another field.
         """
-        state_dict = self.instant_balance.state_dict(prefix="instant_balance.") | {
-            name.replace("color_network", "colour_network"): value for name, value in state_dict.items()
-        }
         return super().load_state_dict(state_dict, strict=True, assign=assign)

@@ -1,4 +1,4 @@
-"""Evaluation over the whole set of held-out frames."""
+"""The pipeline: training steps, corrections of poses, and scores over all held-out frames and events."""
 
 from __future__ import annotations
 
@@ -55,42 +55,44 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer_elements import ViewerControl
 
 SLOPE_PAIRS = 64
-"""Pairs of a step of which slopes of brightness are rendered: enough to learn one number from."""
+"""Number of pairs of a step at which slopes of brightness are rendered: enough to learn one number, the lag."""
 
 SLOPES_EVERY = 4
-"""Steps from one of which slopes are rendered to the next."""
+"""Steps between two steps in which slopes are rendered."""
 
 LAG_TOLD_AFTER = 200
-"""Steps after which a lag that is learned has shown itself: one of 1.6 ms comes to two thirds of that, on a sensor
-without one it stays within 0.04 ms of 0."""
+"""Step at which the learned lag is judged. By then the estimate of a lag of 1.6 ms is two thirds of that, and the
+estimate for a sensor without lag is below 0.04 ms."""
 
 PLACES_A_SIDE = 4
-"""Columns and rows of places in a pixel whose mean brightness is what the pixel sees. Events fire while an edge goes
-through their pixel, so that the true scene, seen through the centre alone, explains 0.84 to 0.87 of them (correlation),
-and over the area 0.998 (`benchmarks/instants.py`)."""
+"""Columns and rows of points in a pixel over which the scores of events average brightness. Events fire while an edge
+crosses their pixel: the true scene, rendered at the centre alone, has a correlation of 0.84 to 0.87 with them, and over
+the area 0.998 (`benchmarks/instants.py`)."""
 
 SLOPE_NS = 1_000_000
-"""Time (ns) before and after an instant between which the slope of brightness is rendered."""
+"""Time (ns) before and after an instant over which the slope of brightness is rendered."""
 
 
 @dataclass
 class EnerfPipelineConfig(VanillaPipelineConfig):
-    """Nerfstudio's pipeline, with one brightness fit over all held-out frames."""
+    """The config of Nerfstudio's pipeline, with poses to correct and with what was chosen for the recording."""
 
     _target: Type = field(default_factory=lambda: EnerfPipeline)  # noqa: UP006
     datamanager: EnerfDataManagerConfig = field(default_factory=EnerfDataManagerConfig)
     model: EnerfModelConfig = field(default_factory=EnerfModelConfig)
     poses: Annotated[RefinerConfig, tyro.conf.arg(name="")] = field(default_factory=RefinerConfig)
     defaults: Fixed[Suppress[MethodDefaults]] = field(default_factory=MethodDefaults)
-    """What is used where neither flag nor preset says otherwise."""
+    """Defaults of the method, for settings that neither a flag nor a preset sets."""
     resolution: Fixed[Suppress[Resolution]] = field(default_factory=Resolution)
-    """What was chosen for the recording, and why; empty before that."""
+    """The choices for the recording, with their reasons; empty until the config is resolved."""
 
     def setup(self, **kwargs: Any) -> EnerfPipeline:
-        """The pipeline, with what the resolution says in place of what is open here.
+        """The pipeline, with the choices of the resolution in place of the fields that are None.
+
+        A config that was not resolved by the trainer's config is resolved here.
 
         Raises:
-            SystemExit: The recording cannot be used, or not so; with one sentence.
+            SystemExit: The recording, or a setting, cannot be used; with one sentence.
         """
         silence_known_warnings()
         make_ffmpeg_available()
@@ -100,37 +102,34 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
             if not resolution.choices:
                 resolution = resolve(self, self.datamanager.dataparser.setup().recording())
             filled = resolution.applied_to(self)
-            if kwargs.get("test_mode") == "inference":  # ns-render dataset makes data managers of this config, too
+            if kwargs.get("test_mode") == "inference":  # ns-render dataset makes more data managers of this config
                 self.datamanager = filled.datamanager
             return self._target(filled, **kwargs)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reads config.yml of runs from before choices were stored apart from what was set, and before poses were
-        refined, too."""
-        as_read = RefinerConfig(refine_clock=False, refine_mount=False, refine_lens=False, refine_drift=False)
-        self.__dict__.update({"defaults": MethodDefaults(), "resolution": Resolution(), "poses": as_read, **state})
 
 
 @dataclass(frozen=True)
 class TrainStep:
-    """What one training step looked at, rendered and lost, without its graph."""
+    """Batch, render and losses of one training step, detached from its graph."""
 
     batch: TrainBatch
     rgb: Tensor
-    """Rendered, shape (rays, 3), in the order of `TrainBatch.split`."""
+    """Rendered brightness, shape (rays, 3), in the order of `TrainBatch.split`."""
     accumulation: Tensor
-    """Share of each ray that surfaces stop, shape (rays, 1)."""
+    """Accumulation of each ray, shape (rays, 1)."""
     losses: dict[str, Tensor]
-    """Each term with its weight."""
+    """Weighted losses by name."""
 
 
 class EnerfPipeline(VanillaPipeline):
-    """Scores held-out frames together, because events fix brightness only up to one scale and offset."""
+    """Trains on a recording, and scores all held-out frames together.
+
+    Events determine brightness only up to one scale and one offset of its logarithm, which are fitted over all frames.
+    """
 
     datamanager: EnerfDataManager
     config: EnerfPipelineConfig
     last_step: TrainStep
-    """The last training step, once there was one."""
+    """The last training step; not set before the first."""
     _seen: tuple[int, SeenVolume] | None = None
 
     def __init__(
@@ -138,11 +137,11 @@ class EnerfPipeline(VanillaPipeline):
     ):
         super().__init__(config, device, **kwargs)
         self.stopwatch = Stopwatch(device)
-        """Is told where each part of a step ends."""
+        """Measures the parts of a step."""
         self.num_steps: float = math.inf
-        """Steps of the training that are known to come, towards whose end poses stay as they are."""
+        """Number of steps of the training; poses are not corrected towards its end. Infinite while unknown."""
         self.seconds_a_step: float | None = None
-        """What a training step will take; None where nobody needs to know, since it is small."""
+        """Predicted seconds of a training step; None for small steps, which are not measured."""
         trains = kwargs.get("test_mode", "val") == "val"
         self._fit_memory(trains)
         if trains:
@@ -168,16 +167,16 @@ class EnerfPipeline(VanillaPipeline):
 
     @property
     def viewer(self) -> ViewerControl:
-        """What makes Nerfstudio's viewer one on the recording; the viewer looks for it among the attributes of the
-        pipeline, and nobody else asks."""
+        """The control that adapts Nerfstudio's viewer to the recording. The viewer finds it among the attributes of the
+        pipeline."""
         if self._viewer is None:
-            from enerf_ns.method.viewer.scene_view import SceneView  # here, since hardly any command shows a viewer
+            from enerf_ns.method.viewer.scene_view import SceneView  # here, since most commands show no viewer
 
             self._viewer = SceneView(self.model, self.datamanager)
         return self._viewer
 
     def seen_volume(self) -> SeenVolume:
-        """What the events' camera saw of the field as it is; made when it is first asked for after a training step."""
+        """The volume that the camera of the events saw of the current field. It is computed once after a step."""
         steps = self.datamanager.train_count
         if self._seen is None or self._seen[0] != steps:
             manager = self.datamanager
@@ -185,10 +184,10 @@ class EnerfPipeline(VanillaPipeline):
         return self._seen[1]
 
     def _fit_memory(self, trains: bool) -> None:
-        """Has the field be asked in parts where a training step, or a part of a picture, would not fit the memory.
+        """Evaluates the field in parts if a training step, or a chunk of a picture, would not fit the memory.
 
         Raises:
-            FlagError: A training step does not fit in any way.
+            FlagError: A training step does not fit even in parts.
         """
         config = self.model.config
         trained = self.datamanager.get_train_rays_per_batch() if trains else 0
@@ -198,8 +197,8 @@ class EnerfPipeline(VanillaPipeline):
         cost, free = step_cost(self.model, rays, config.num_samples), free_bytes(self.device)
         at_once = cost.samples_at_once(free)
         need = (
-            f"{rays} rays with {config.num_samples} samples each keep {cost.bytes / 1e9:.1f} GB, with gradients twice "
-            f"that, and {free / 1e9:.1f} GB are free"
+            f"{rays} rays with {config.num_samples} samples each need {cost.bytes / 1e9:.1f} GB of memory, twice that "
+            f"with gradients, but {free / 1e9:.1f} GB are free"
         )
         if at_once == 0 and trains:
             raise FlagError(
@@ -209,7 +208,8 @@ class EnerfPipeline(VanillaPipeline):
         if at_once is not None:
             at_once = max(at_once, config.num_samples)
             say(
-                f"{need}: the field is asked for {at_once} samples at a time, and when it learns twice, a third slower."
+                f"{need}. The field is evaluated at {at_once} samples at a time, and twice in training, which takes a "
+                "third longer."
             )
         self.model.samples_at_once = at_once
         again = 1.0 if at_once is None else 4.0 / 3.0  # parts are rendered once more for the backward pass
@@ -217,7 +217,7 @@ class EnerfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _start_threshold_map(self) -> None:
-        """Has the map of thresholds start from what events tell before training, where pixels are never blind."""
+        """Starts the map of thresholds from an estimate from the events, if the sensor has no refractory period."""
         sensor = self.model.sensor
         if sensor.threshold_map is None or sensor.refractory_period:
             return
@@ -250,11 +250,11 @@ class EnerfPipeline(VanillaPipeline):
         return outputs, losses, metrics
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
-        """Has the poses corrected, now and then, by what pairs of a training step tell."""
+        """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""
         may_begin = step < BEGINS_UNTIL * self.num_steps
         every = LOOK_AGAIN_EVERY if refiner.corrected and may_begin else LOOK_EVERY
         if not (refiner.corrected or may_begin):
-            return  # nothing is, or will be
+            return  # nothing was corrected, and nothing will be
         if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
@@ -267,7 +267,7 @@ class EnerfPipeline(VanillaPipeline):
         times = manager.event_times(some, sensor)
         camera = manager.event_camera
         unit = float(sensor.mean_threshold)
-        with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training draws as without looks
+        with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training must draw as without this
             rgb, slopes = render_slopes(
                 model,
                 rays,
@@ -280,7 +280,7 @@ class EnerfPipeline(VanillaPipeline):
             change = brightness_change(start, end, some, sensor) / unit
             residual = sensor.measured_change(some) / unit - change
             others = torch.stack([change, (some.on + some.off).float(), 1e-9 * (some.end - some.start).float()], dim=1)
-            lags = torch.zeros(2, len(some), 2)  # the clock is told only as far as these do not explain the same
+            lags = torch.zeros(2, len(some), 2)  # delays of the sensor, which the clock must not explain
             if sensor.learns_lag:
                 lags[..., 0] = 1.0 / sensor.cutoff_share(rgb, some.pixels.repeat(2)).view(2, -1).cpu()
             if sensor.refractory_period and some.starts_at_events:
@@ -297,7 +297,7 @@ class EnerfPipeline(VanillaPipeline):
             self._correct_poses()
 
     def _correct_poses(self) -> None:
-        """Has rays, and held-out frames, follow the poses as they are corrected by now."""
+        """Applies the current corrections of the poses to the rays and to the held-out frames."""
         if self.poses is not None:
             self.datamanager.correct(self.poses.corrections)
 
@@ -309,8 +309,8 @@ class EnerfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _slopes(self, batch: EventBatch, number: int) -> Float[Tensor, "pairs 2"]:
-        """By how much rendered log brightness changes a second around both instants of the first pairs of events, up to
-        a number; 0 of the others."""
+        """Slopes of the rendered log brightness (1/s) at both instants of the first `number` pairs of events; 0 for the
+        other pairs."""
         manager, sensor = self.datamanager, self.model.sensor
         number = min(number, len(batch) - batch.num_silent)
         found = torch.zeros(len(batch), 2, device=batch.start.device)
@@ -329,7 +329,7 @@ class EnerfPipeline(VanillaPipeline):
         return found
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs, losses and metrics of the next batch, as of `get_train_loss_dict` but rendered as in evaluation."""
+        """Outputs, losses and metrics of the next batch, rendered as in evaluation."""
         self.eval()
         with torch.no_grad():
             results = self.get_train_loss_dict(step)
@@ -338,8 +338,15 @@ class EnerfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def event_scores(self, num_pairs: int = 2048) -> dict[str, Score]:
-        """The scores of the protocol "events", over random pairs of the events that are held out in time
-        (`held_out_events`); where none are, of the training's. What a pixel sees is rendered over its area.
+        """The scores of the protocol "events" over random pairs of held-out events.
+
+        The brightness of a pixel is averaged over its area. With `held_out_events` 0, training pairs are scored.
+
+        Args:
+            num_pairs: Number of pairs.
+
+        Returns:
+            The scores by name; a sentence in place of each score if there is no such pair.
         """
         manager, sensor = self.datamanager, self.model.sensor
         sampler = manager.held_out_pair_sampler if manager.config.held_out_events else manager.pair_sampler
@@ -360,12 +367,12 @@ class EnerfPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """The `summary_scores` that have a value; what has none is printed, with the reason, and so is the protocol.
+        """The `summary_scores` that have a value. Prints the protocol, and for each score without a value the reason.
 
         Args:
-            step: Given while training, when Nerfstudio logs what is returned: the name of the protocol is left out.
-            output_path: Folder for one picture a frame, recorded beside rendered.
-            get_std: Give the standard deviation over the frames too.
+            step: Step of the training, if Nerfstudio logs the result: the name of the protocol is left out then.
+            output_path: Folder for one picture of each frame, recorded beside rendered.
+            get_std: Also return the standard deviation over the frames.
 
         Raises:
             SystemExit: The pictures cannot be written; with one sentence.

@@ -1,4 +1,5 @@
-"""Whether a part of the model helps on a scene: two short trainings, compared on pixels that neither learnt from."""
+"""A probe whether the viewing direction helps on a scene: short trainings with and without it, compared on pixels that
+are held out from both."""
 
 from __future__ import annotations
 
@@ -15,20 +16,19 @@ from enerf_ns.events.batch import TrainBatch
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig
 
 SEEDS = 3
-"""Trainings of each kind: early on, two that differ by their seed alone may be far apart."""
+"""Number of trainings of each kind: after few steps, two that differ by their seed alone can be far apart."""
 
 STEPS = 100
 """Steps of each training."""
 
 PAIRS = 256
-"""Pairs of events, and pixels of frames, of a step at most."""
+"""Largest number of pairs of events, and of pixels of frames, of a step."""
 
 HELD_OUT_EVERY = 8
-"""Number of pixels of which one is kept from these trainings."""
+"""One of so many pixels is held out from these trainings."""
 
 SCORED_BATCHES = 16
-"""Batches of held-out pixels by which they are compared."""
-
+"""Number of batches of held-out pixels on which the trainings are compared."""
 
 MEASURED = ("event_loss", "instant_loss", "frame_loss")
 """Losses that compare the field with what was recorded."""
@@ -37,17 +37,17 @@ MEASURED = ("event_loss", "instant_loss", "frame_loss")
 def view_direction_gain(
     config: EnerfPipelineConfig, optimizer: OptimizerConfig, device: str | torch.device
 ) -> tuple[float, float]:
-    """By which share the error at held-out pixels falls where brightness may depend on the viewing direction.
+    """Relative decrease of the error at held-out pixels if brightness may depend on the viewing direction.
 
-    Random numbers of the process stay as they were; of one config the answer is found once in a process.
+    The states of the random generators do not change. The result of a config is computed once in a process.
 
     Args:
-        config: With all but `model.view_direction` decided.
-        optimizer: Of the field.
-        device: To train on.
+        config: Config in which only `model.view_direction` is None.
+        optimizer: Optimiser of the field.
+        device: Device of the training.
 
     Returns:
-        Gain, and its standard error over the seeds.
+        The decrease as a share of the error, and its standard error over the seeds.
     """
     return _gain(yaml.dump(config), yaml.dump(optimizer), str(device))
 
@@ -62,7 +62,7 @@ def _gain(config: str, optimizer: str, device: str) -> tuple[float, float]:
 
 
 def _error(config: str, optimizer: str, device: str, view_direction: bool, seed: int) -> float:
-    """Mean loss at held-out pixels, the same for either answer, after a short training on the others."""
+    """Mean loss at held-out pixels after a short training on the other pixels."""
     short: EnerfPipelineConfig = yaml.load(config, Loader=yaml.Loader)
     short.model.view_direction = view_direction
     manager = short.datamanager
@@ -74,7 +74,7 @@ def _error(config: str, optimizer: str, device: str, view_direction: bool, seed:
         torch.manual_seed(seed)
         pipeline: EnerfPipeline = short._target(short, device=device, test_mode="val")
         adam = yaml.load(optimizer, Loader=yaml.Loader).setup(params=pipeline.model.get_param_groups()["fields"])
-        what = f"Probing gloss, {'with' if view_direction else 'without'} it ({seed + 1} of {SEEDS})"
+        what = f"Probe {seed + 1} of {SEEDS} {'with' if view_direction else 'without'} the viewing direction"
         for _ in track(range(STEPS), what, console=CONSOLE, transient=True):
             adam.zero_grad()
             torch.stack([*_losses(pipeline, held_out=False).values()]).sum().backward()
@@ -87,7 +87,7 @@ def _error(config: str, optimizer: str, device: str, view_direction: bool, seed:
 
 
 def _losses(pipeline: EnerfPipeline, held_out: bool) -> dict[str, torch.Tensor]:
-    """The losses of the next batch, of which only the held-out pixels are looked at, or only the others."""
+    """The losses of the next batch, at its held-out pixels alone, or at its other pixels alone."""
     manager, model = pipeline.datamanager, pipeline.model
     batch = manager.next_batch(model.sensor)
     events, frames = batch.events, batch.frames

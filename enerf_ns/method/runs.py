@@ -1,4 +1,4 @@
-"""Runs of the methods from Python: configure one, train it as `ns-train` does, load it again."""
+"""Runs from Python: configure a method, train it as `ns-train` does, and load the run again."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """A trained run, as it was stored."""
+    """A trained run, loaded from its folder."""
 
     config_file: Path
     """config.yml of the run."""
     config: EnerfTrainerConfig
-    """Config that config.yml holds."""
+    """The config that config.yml holds."""
     pipeline: EnerfPipeline
-    """Pipeline with the parameters of the last checkpoint."""
+    """The pipeline, with the parameters of the last checkpoint."""
     train_seconds: float | None = None
-    """Time (s) of the training steps; None of a run that was loaded."""
+    """Time (s) of all training steps; None for a run that was loaded."""
 
 
 def method_config(
@@ -43,13 +43,13 @@ def method_config(
     """The configuration of a method, to train without a viewer.
 
     Args:
-        name: Of the method, such as `enerf`.
+        name: Name of the method, such as `enerf`.
         data: Folder of a recording.
-        output_dir: Where runs go, each into a folder of its own.
+        output_dir: Folder of all runs; each run has a folder of its own in it.
         changes: Values by the names of ns-train's flags, such as {"pipeline.datamanager.event_pairs": 512}.
 
     Raises:
-        FlagError: No method, or no setting, has such a name.
+        FlagError: There is no method or no setting of such a name.
     """
     from nerfstudio.configs.method_configs import all_methods
 
@@ -71,27 +71,26 @@ def method_config(
 
 
 def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:
-    """A trainer as `ns-train` makes it: random numbers seeded by `config.machine.seed`, everything set up.
+    """A trainer that is set up as `ns-train` does it, with random generators seeded by `config.machine.seed`.
 
-    What Nerfstudio logs goes to this run from now on, and to none before it in this process.
+    Nerfstudio's logs go to this run from now on, and no longer to earlier runs of this process.
     """
-    from nerfstudio.utils import writer
+    from enerf_ns.method.nerfstudio_seams import start_new_logs
 
     random.seed(config.machine.seed)
     np.random.seed(config.machine.seed)  # noqa: NPY002 - libraries draw from it
     torch.manual_seed(config.machine.seed)
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
+    start_new_logs()
     trainer: EnerfTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
 
 
 def train(config: EnerfTrainerConfig) -> Run:
-    """Train in this process with all that `ns-train` does, and load what was stored.
+    """Trains in this process as `ns-train` does, and loads the run.
 
     Args:
-        config: Of the run; its time stamp, which names the run's folder, is set unless it is set already.
+        config: Configuration of the run. Its time stamp, which names the run's folder, is set if it is not set yet.
 
     Raises:
         RecordingError: The recording cannot be used; nothing is written then.
@@ -112,7 +111,7 @@ def train(config: EnerfTrainerConfig) -> Run:
 
 
 def load(config_file: Path) -> Run:
-    """A trained run of one of this package's methods, to evaluate it.
+    """A trained run of a method of this package, to evaluate it.
 
     Args:
         config_file: config.yml of the run.
@@ -133,11 +132,11 @@ def load(config_file: Path) -> Run:
 def load_any_method(
     config_file: Path, test_mode: Literal["test", "val", "inference"]
 ) -> tuple[TrainerConfig, Pipeline]:
-    """A trained run of any of Nerfstudio's methods.
+    """Config and pipeline of a trained run of any of Nerfstudio's methods.
 
     Args:
         config_file: config.yml of the run.
-        test_mode: What of the data is loaded, as of Nerfstudio's `eval_setup`.
+        test_mode: Split of the data that is loaded, as in Nerfstudio's `eval_setup`.
 
     Raises:
         RecordingError: The file is missing or cannot be loaded.
@@ -152,7 +151,7 @@ def load_any_method(
     try:
         with without_chatter():
             return eval_setup(config_file, test_mode=test_mode)[:2]
-    except (Exception, SystemExit) as error:  # whatever of a run is missing or of another version
+    except (Exception, SystemExit) as error:  # the kind depends on what is missing, or of another version
         reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
         if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):
             reason = "its checkpoints are not found"  # the folder is empty or missing, which Nerfstudio only prints

@@ -1,4 +1,4 @@
-"""Times calls, and the parts of a training step, on a device whose work is waited for."""
+"""Timing of calls, and of the parts of a training step. It waits until the device has finished."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import torch
 
 
 def seconds_of(call: Callable[[], object], device: torch.device | str) -> float:
-    """Wall time of a call, with its work on a device and without what that did before."""
+    """Wall time of a call in seconds, with its work on a device, but without earlier work of the device."""
     start = _now(torch.device(device))
     call()
     return _now(torch.device(device)) - start
 
 
 def _now(device: torch.device) -> float:
-    """A time in seconds at which the device has nothing left to do."""
+    """The time in seconds, after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 class Stopwatch:
-    """Seconds of each part of what is timed; before it is started, and after it is stopped, it does nothing.
+    """Measures the seconds of each part of a step. It does nothing before `start` and after `stop`.
 
     Args:
-        device: Whose work is waited for at the end of each part.
+        device: Device whose work belongs to the parts.
     """
 
     def __init__(self, device: torch.device | str):
@@ -39,13 +39,13 @@ class Stopwatch:
         self._last = _now(self.device)
 
     def lap(self, part: str) -> None:
-        """Ends a part, which began where the one before it ended."""
+        """Ends a part, which began at the end of the part before it."""
         if self._last is not None:
             now = _now(self.device)
             self._parts[part] = self._parts.get(part, 0.0) + now - self._last
             self._last = now
 
     def stop(self) -> dict[str, float]:
-        """The parts, in the order in which they first ended."""
+        """Seconds of the parts by name, in the order in which they first ended."""
         self._last = None
         return self._parts

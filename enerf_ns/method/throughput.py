@@ -1,4 +1,4 @@
-"""How many rays a training step has on a device that is fast enough for more: measured, since no two GPUs are alike."""
+"""The number of rays of a training step on a fast device. It is measured, since GPUs differ."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig
 from enerf_ns.method.stopwatch import seconds_of
 
 LARGEST_FACTOR = 32
-"""Times as many rays as the method has, at most: about those of the paper."""
+"""Largest factor on the number of rays of the method; with it, a step has about the rays of the paper."""
 
 LONGER = 1.5
-"""Times as long, at most, that a step takes with more rays."""
+"""Largest factor on the time of a step that more rays may cost."""
 
 REPETITIONS = 5
-"""Steps of each size that are timed, of which the fastest counts."""
+"""Number of steps of each size that are timed; the fastest counts."""
 
 
 def largest_factor(seconds: Callable[[int], float]) -> int:
     """The largest power of two, up to `LARGEST_FACTOR`, with which a step takes at most `LONGER` times as long.
 
     Args:
-        seconds: That a step takes with so many times as many rays; not asked beyond the first that is too slow.
+        seconds: Returns the time of a step by the factor on its rays. It is not called beyond the first slow one.
     """
     factor, most = 1, LONGER * seconds(1)
     while factor < LARGEST_FACTOR and seconds(2 * factor) <= most:
@@ -34,12 +34,13 @@ def largest_factor(seconds: Callable[[int], float]) -> int:
 
 
 def seconds_of_step(model: EnerfModel, num_rays: int) -> float:
-    """Seconds of rendering rays from the middle of the scene, forward and backward; nothing is learnt, and random
-    numbers stay as they were.
+    """Seconds of rendering rays from the middle of the scene, forward and backward.
+
+    The parameters and the states of the random generators do not change.
 
     Args:
-        model: On its device.
-        num_rays: Of the step.
+        model: Model on its device.
+        num_rays: Number of rays.
     """
     device = model.scene_box.aabb.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -52,12 +53,12 @@ def seconds_of_step(model: EnerfModel, num_rays: int) -> float:
 
 
 def batch_factor(config: EnerfPipelineConfig, device: torch.device | str) -> int:
-    """How many times the rays of the method a step may have on a device: 1 on a CPU, where twice as many take twice as
+    """Factor on the number of rays of the method for a device. It is 1 on a CPU, where twice as many rays take twice as
     long.
 
     Args:
-        config: With everything decided.
-        device: To train on.
+        config: Config without a field that is None.
+        device: Device of the training.
     """
     if torch.device(device).type == "cpu":
         return 1

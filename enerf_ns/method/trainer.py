@@ -1,5 +1,5 @@
-"""Training as a person sees it: what the recording holds at the start, where everything lies at the end, and what
-becomes of a run that is interrupted, or whose steps go wrong."""
+"""The trainer: it resolves the config, prints the start and the end of training, and keeps a run through interruptions,
+full disks and steps that are not finite."""
 
 from __future__ import annotations
 
@@ -65,6 +65,7 @@ from enerf_ns.method.guarded_steps import (
     why_nothing_is_learnt,
 )
 from enerf_ns.method.model import EnerfModel
+from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
 from enerf_ns.method.throughput import batch_factor
@@ -72,49 +73,46 @@ from enerf_ns.poses.findings import findings
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
 
-SAMPLER_COUNTERS = ("_step", "_steps_since_update")
-"""What Nerfstudio's proposal sampler remembers from step to step."""
-
 POSES_FILE = "poses.json"
-"""What was found to be wrong with clock, poses and lens, in the folder of a run."""
+"""Name of the file in a run's folder that states the errors found in clock, poses and lens."""
 
 LONG = 3600.0
-"""Seconds of training beyond which it is said beforehand how long it takes."""
+"""Seconds of training from which the time that it takes is printed at the start."""
 
 
 @dataclass
 class EnerfTrainerConfig(TrainerConfig):
-    """Nerfstudio's trainer; reads and checks the recording before anything is written."""
+    """The config of a run. It reads and checks the recording before anything is written."""
 
     _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
     prompt: Fixed[Optional[str]] = None  # noqa: UP045
     preset: Optional[str] = None  # noqa: UP045
-    """The selections of the E-NeRF paper for one of its sequences; flags that are set stand. One of eds00, eds11,
-    mocap-1d-trans, mocap-desk2, mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse,
-    spiral1-more-sparse, spiral2."""
+    """Settings of the E-NeRF paper for one of its sequences: eds00, eds11, mocap-1d-trans, mocap-desk2,
+    mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse, spiral1-more-sparse or
+    spiral2. Flags that you set take precedence. Default: no preset."""
 
     evaluation_share: float = 0.03
-    """Share of the training time that may go into evaluation meanwhile: scores of a few held-out frames and of held-out
-    events at moments evenly spaced in log time (history.jsonl), and previews. All held-out frames are scored once more
-    at the end, on top of that. 0: nothing is evaluated, at the end neither."""
+    """Largest share of the training time that evaluation takes during training: it scores a few held-out frames and the
+    held-out events at moments evenly spaced in log time (history.jsonl), and stores previews. All held-out frames are
+    scored once at the end, in extra time. With 0 nothing is evaluated, not even at the end."""
 
     def __post_init__(self) -> None:
-        """Looks at the config.yml that a flag names, since Nerfstudio reads it itself, with a traceback."""
+        """Checks the config.yml of --load-config, since Nerfstudio would end with a traceback."""
         if self.load_config is not None:
             with exit_with_a_sentence():
                 read_config(absolute(self.load_config))
 
     def resolved(self) -> EnerfTrainerConfig:
-        """A copy with absolute paths, with the length of the learning rates' decay, and with what is chosen for the
-        recording (`pipeline.resolution`), whose events are read and checked.
+        """A copy in which everything is decided: absolute paths, the length of the decay of learning rates, and the
+        choices for the recording (`pipeline.resolution`). The events of the recording are read and checked.
 
-        What was chosen is kept with this config and its copies until a setting changes: Nerfstudio stores config.yml,
-        and then sets up a process for each device, where another measurement would give another batch.
+        The choices are kept with this config and its copies until a setting changes. Nerfstudio stores config.yml, and
+        then sets up one process for each device, where a second measurement could give another batch.
 
         Raises:
-            RecordingError: The recording cannot be used, or the checkpoint to go on from.
-            FlagError: A setting cannot be followed.
+            RecordingError: The recording, or the checkpoint to continue from, cannot be used.
+            FlagError: A flag cannot be followed.
             OutputError: The run's folder holds another run.
         """
         check_ranges(self)
@@ -132,7 +130,7 @@ class EnerfTrainerConfig(TrainerConfig):
         config.load_dir = self.load_dir and absolute(self.load_dir)
         config.load_checkpoint = self.load_checkpoint and absolute(self.load_checkpoint)
         checkpoint = config.checkpoint()
-        decays = load_checkpoint(checkpoint).get("max_steps", {}) if checkpoint else {}
+        decays = load_checkpoint(checkpoint)["max_steps"] if checkpoint else {}
         for name, group in config.optimizers.items():
             scheduler = group["scheduler"]
             scheduler.max_steps = scheduler.max_steps or decays.get(name) or self.max_num_iterations
@@ -155,10 +153,10 @@ class EnerfTrainerConfig(TrainerConfig):
         return config
 
     def _check_output_dir(self) -> None:
-        """Refuses a place where no folder of a run can be, before anything that takes time.
+        """Checks that the run's folder can be made, before anything that takes time.
 
         Raises:
-            OutputError: It is the one that is set.
+            OutputError: It cannot.
         """
         check_outside_recordings("--output-dir", self.get_base_dir())
         there = next(folder for folder in (self.output_dir, *self.output_dir.parents) if folder.exists())
@@ -169,13 +167,13 @@ class EnerfTrainerConfig(TrainerConfig):
             raise _unwritable(self.output_dir, error) from error
 
     def _check_device(self) -> None:
-        """Refuses a device, or a backend of the hash grid, that is not there.
+        """Checks that the machine has the device, and that the backend of the hash grid runs on it.
 
         Raises:
-            FlagError: It is the one that is set.
+            FlagError: It has not, or it does not.
         """
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
-            raise FlagError("--machine.device-type is cuda, but no GPU can be used; check its driver, or give cpu.")
+            raise FlagError("--machine.device-type is cuda, but PyTorch finds no GPU; check its driver, or give cpu.")
         name = self.pipeline.model.hash_grid
         if name not in ("auto", "torch"):
             positions = torch.empty(0, 3, device=self.machine.device_type)
@@ -185,10 +183,10 @@ class EnerfTrainerConfig(TrainerConfig):
                 raise FlagError(f"--pipeline.model.hash-grid: {error}.") from error
 
     def _check_fits(self, checkpoint: Path) -> None:
-        """Refuses a checkpoint of another field, sensor or box of the scene than those of this config, when resolved.
+        """Checks that a checkpoint has the field, the sensor and the scene box of this config, which is resolved.
 
         Raises:
-            FlagError: It is such a one.
+            FlagError: It has others.
         """
         filled = self.pipeline.resolution.applied_to(self.pipeline)
         parser = filled.datamanager.dataparser.setup()
@@ -218,17 +216,19 @@ class EnerfTrainerConfig(TrainerConfig):
             )
 
     def recording(self) -> EventRecording:
-        """The recording that is learnt from, of a config that is resolved."""
+        """The recording of a config that is resolved."""
         return self.pipeline.resolution.applied_to(self.pipeline).datamanager.dataparser.setup().recording()
 
     def checkpoint(self) -> Path | None:
-        """The checkpoint that training goes on from: the newest whole one of a run that config.yml was loaded of, else
-        what the flags name, else None.
+        """The checkpoint that training continues from; None for a new run.
+
+        For a config that was loaded from config.yml, it is the newest whole checkpoint of the run. Else it is the
+        checkpoint that the flags name.
 
         Raises:
-            RecordingError: There are checkpoints, and none is whole.
-            FlagError: A checkpoint that a flag names is not there, or the run is to end before it.
-            OutputError: The run's folder holds a run already that neither config.yml nor a flag names.
+            RecordingError: The run has checkpoints, but none is whole.
+            FlagError: The checkpoint that a flag names is missing or damaged, or the run would end before its step.
+            OutputError: The run's folder holds a run that neither config.yml nor a flag names.
         """
         folder = super().get_checkpoint_dir()
         own = newest_checkpoint(folder)
@@ -251,27 +251,27 @@ class EnerfTrainerConfig(TrainerConfig):
             path = checkpoint_path(self.load_dir, self.load_step or 0) if self.load_dir else self.load_checkpoint
             assert path is not None
             if not is_whole(path):
-                found = "is cut short, damaged or none" if path.exists() else "does not exist"
+                found = "is cut short or damaged, or is no checkpoint" if path.exists() else "does not exist"
                 raise FlagError(f"The checkpoint {path} {found}; give another with --load-step or --load-checkpoint.")
         else:
             return None
         step = load_checkpoint(path)["step"]
         if step + 1 >= self.max_num_iterations:
             raise FlagError(
-                f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give more "
-                "to train on."
+                f"--max-num-iterations {self.max_num_iterations} counts the {step + 1} steps of {path}, too; give a "
+                "larger number to continue."
             )
         return path
 
     def get_checkpoint_dir(self) -> Path:
-        """The folder of the run's checkpoints; `load_step` becomes that of the newest whole one in it.
+        """The folder of the run's checkpoints. Sets `load_step` to the step of the newest whole checkpoint in it.
 
-        Nerfstudio's tools, from ns-eval to ns-viewer, ask a config for this folder and for nothing else before they
-        load `load_step` of it, or where that is None the newest by name, whole or not. This is the one place at which
-        they can be told better.
+        Nerfstudio's commands, from ns-eval to ns-viewer, ask a config for this folder, and then load the checkpoint of
+        `load_step`, or the newest by name where that is None, whether it is whole or not. They call nothing else of the
+        config before they load, so that the step must be set here.
 
         Raises:
-            SystemExit: The folder is there, but no whole checkpoint in it; with one sentence.
+            SystemExit: The folder exists, but holds no whole checkpoint; with one sentence.
         """
         folder = super().get_checkpoint_dir()
         with exit_with_a_sentence():
@@ -281,10 +281,10 @@ class EnerfTrainerConfig(TrainerConfig):
         return folder
 
     def print_to_terminal(self) -> None:
-        """Prints nothing: what is chosen is a table, and all settings are in config.yml."""
+        """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Show what the recording holds and what is made of it, then store both with the run."""
+        """Prints tables of the recording and of the choices for it, and stores config.yml and choices.json."""
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
@@ -301,11 +301,12 @@ class EnerfTrainerConfig(TrainerConfig):
             say_where("configuration", quoted(folder / "config.yml"))
 
     def setup(self, **kwargs: Any) -> EnerfTrainer:
-        """The trainer, of what this config comes to on its recording."""
+        """The trainer of this config, resolved for its recording."""
         with exit_with_a_sentence():
             silence_known_warnings()
             config = self.resolved()
             config.load_checkpoint, config.load_dir = config.checkpoint(), None
+            config.data = None  # so that the viewer keeps camera paths with the run
             with without_chatter():
                 return self._target(config, **kwargs)
 
@@ -315,10 +316,10 @@ def _unwritable(folder: Path, error: OSError) -> OutputError:
 
 
 class EnerfTrainer(Trainer):
-    """Nerfstudio's trainer, which survives: an interruption, a full disk, a step that is not finite.
+    """Nerfstudio's trainer, which survives an interruption, a full disk, and a step that is not finite.
 
-    A step whose losses or gradients are not finite changes neither parameters nor the state of the optimisers; the
-    learning rate goes on with the number of the step.
+    A step whose losses or gradients are not finite changes neither the parameters nor the state of the optimisers. The
+    learning rate follows the number of the step all the same.
     """
 
     config: EnerfTrainerConfig
@@ -331,9 +332,9 @@ class EnerfTrainer(Trainer):
         """Steps that were left out because they were not finite."""
         self._skipped_in_a_row = 0
         self._unseen: Later[tuple[int, TrainStep]] | None = None  # the last step
-        self._trained = -1  # the last step that was
+        self._trained = -1  # the last step that was taken
         self._interrupted = False
-        self._recorded: dict[str, Any] | None = None  # of the time before the checkpoint
+        self._recorded: dict[str, Any] | None = None  # state of ErrorAgainstTime at the checkpoint
         self._unsaved = ""  # why the last checkpoint could not be stored
         self._found_wrong: set[str] = set()
         self._handlers: dict[int, Any] = {}
@@ -341,55 +342,49 @@ class EnerfTrainer(Trainer):
     @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         config = self.config
-        data, config.data = config.data, None  # so that the viewer keeps camera paths with the run
-        try:
-            with without_chatter():
-                super().setup(test_mode)
-        finally:
-            config.data = data
+        with without_chatter():
+            super().setup(test_mode)
         self.pipeline.num_steps = config.max_num_iterations
         self.error_against_time = ErrorAgainstTime(
             self.pipeline, self.base_dir, config.max_num_iterations, config.evaluation_share
         )
-        if is_main_process():  # of those that train together, one tells of it
+        if config.load_checkpoint is not None:
+            self._resume(load_checkpoint(config.load_checkpoint))
+        if is_main_process():
             self._say_how_long()
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._finish))
         if isinstance(self.viewer_state, Viewer):
             CONSOLE.print(*self.viewer_state.viewer_info, sep="\n", soft_wrap=True, highlight=False, style="green")
         elif self.viewer_state is not None:
-            CONSOLE.print(f"Legacy viewer at: {self.viewer_state.viewer_url}", soft_wrap=True, style="green")
+            CONSOLE.print(f"Legacy viewer: {self.viewer_state.viewer_url}", soft_wrap=True, style="green")
 
     def _say_how_long(self) -> None:
-        """Says how long training will take, where that is long."""
+        """Prints how long training will take, if that is more than `LONG`."""
         steps = self.config.max_num_iterations - self._start_step
         seconds = steps * (self.pipeline.seconds_a_step or 0.0)
         if seconds > LONG:
             say(
-                f"{steps} steps of {self.pipeline.datamanager.get_train_rays_per_batch()} rays take about "
-                f"{duration(seconds)} on the {self.device}: enerf takes minutes; this is for a GPU."
+                f"{steps} steps of {self.pipeline.datamanager.get_train_rays_per_batch()} rays will take about "
+                f"{duration(seconds)} on the {self.device}. Use a GPU, or the method enerf, which takes minutes."
             )
-
-    def _check_viewer_warnings(self) -> None:
-        """Nothing: evaluation runs under every `--vis`."""
 
     def setup_optimizers(self) -> GuardedOptimizers:
         return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
 
-    def _load_checkpoint(self) -> None:
-        super()._load_checkpoint()
-        if self.config.load_checkpoint is None:
-            return
-        state = load_checkpoint(self.config.load_checkpoint)
-        if state.get("device") == self.pipeline.device.type:  # of an earlier version there is no device
+    def _resume(self, state: dict[str, Any]) -> None:
+        """Restores the state that only this class stores in a checkpoint. Nerfstudio has restored the rest before."""
+        if state["device"] == self.pipeline.device.type:
             set_random_state(state["generators"], self.pipeline.device)
             self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
-        vars(self.pipeline.model.sampler).update(state.get("sampler", {}))
-        self._recorded = state.get("error_against_time")
+        set_sampler_counters(self.pipeline.model.sampler, state["sampler"])
+        self._recorded = state["error_against_time"]
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Stores the run as it is after a step, whole or not at all; where the disk is full, the checkpoints that are
-        there stay, which is said, and training goes on."""
+        """Stores a checkpoint of a step, whole or not at all.
+
+        Where the disk is full, the earlier checkpoints stay, a line says so, and training continues.
+        """
         pipeline = self.pipeline
         state = {
             "step": step,
@@ -403,9 +398,7 @@ class EnerfTrainer(Trainer):
                 **random_state(pipeline.device),
                 "batches": pipeline.datamanager.generator.get_state(),
             },
-            "sampler": {
-                name: value for name, value in vars(pipeline.model.sampler).items() if name in SAMPLER_COUNTERS
-            },
+            "sampler": sampler_counters(pipeline.model.sampler),
             "error_against_time": self.error_against_time.state(),
         }
         path = checkpoint_path(self.checkpoint_dir, step)
@@ -413,7 +406,7 @@ class EnerfTrainer(Trainer):
             write_checkpoint(path, state)
         except OSError as error:
             self._unsaved = f"Step {step} could not be stored in {self.checkpoint_dir} ({error.strerror or error})"
-            say(f"{self._unsaved}; the checkpoints before it stay. Make room.")
+            say(f"{self._unsaved}; the checkpoints before it stay. Make room; training continues.")
             return
         self._unsaved = ""
         if self.config.save_only_latest_checkpoint and not self._skipped_in_a_row:
@@ -423,25 +416,25 @@ class EnerfTrainer(Trainer):
 
     @exit_with_a_sentence()
     def train(self) -> None:
-        """Trains up to step `max_num_iterations` in total; interrupted by SIGINT or SIGTERM, stores a checkpoint first.
+        """Trains up to step `max_num_iterations`, with the steps of earlier sessions. SIGINT and SIGTERM store a
+        checkpoint and end it.
 
         Raises:
-            SystemExit: With code 130, training was interrupted; with a sentence, it was given up, since steps in a row
-                were not finite, the last checkpoint could not be stored, or something else went wrong that the user can
-                mend.
+            SystemExit: With code 130, training was interrupted. With a sentence, training failed: several steps in a
+                row were not finite, the last checkpoint could not be stored, or something else that the user can mend.
         """
         config, total = self.config, self.config.max_num_iterations
         self._trained = self._start_step - 1
         if self._start_step >= total:
-            say(f"The run in {self.base_dir} is at its end, at step {total} of {total}.")
+            say(f"The run in {self.base_dir} is at its end, at step {total} of {total}. Nothing is left to train.")
             return
         self._handle_signals()
-        config.max_num_iterations = total - self._start_step  # Nerfstudio takes it for the steps that are left
+        config.max_num_iterations = total - self._start_step  # Nerfstudio counts from the step of the checkpoint
         try:
             if is_main_process():
                 self.error_against_time.begin(self._start_step, self._recorded)
             super().train()
-        except OSError as error:  # of what Nerfstudio writes beside checkpoints, such as TensorBoard's files
+        except OSError as error:  # from files that Nerfstudio writes beside checkpoints, such as TensorBoard's
             raise SystemExit(
                 f"enerf: Training ended at step {self._trained}, since {self.base_dir} could not be written to "
                 f"({error.strerror or error}); the checkpoints there stay. Make room, and continue with ns-train "
@@ -469,7 +462,7 @@ class EnerfTrainer(Trainer):
         super().eval_iteration(step)
 
     def _look_at_finite(self, step: int) -> None:
-        """Counts steps that were left out; on a GPU the one before this, which it knows by now."""
+        """Counts a step that was left out. On a GPU it looks at the step before, whose result has arrived by now."""
         assert self.optimizers.finite is not None
         latest = Later((step, self.pipeline.last_step), self.optimizers.finite)
         known = self._unseen if self.optimizers.finite.is_cuda else latest
@@ -480,19 +473,16 @@ class EnerfTrainer(Trainer):
             self._skipped_in_a_row = 0
 
     def _finish(self, step: int) -> None:
-        """Scores the run at its end, whose checkpoint is stored by then; an interruption stops that at once."""
+        """Scores the run at its end, after its last checkpoint. An interruption stops the scoring at once."""
         self._restore_signals()
         with self.train_lock:
             self.error_against_time.finish()
-        writer.write_out_storage()
-        for log in writer.EVENT_WRITERS:
-            if isinstance(log, writer.TensorboardWriter):
-                log.tb_writer.flush()
+        flush_tensorboard()
 
     def _is_finite(self) -> Tensor:
-        """Whether the losses of this step are finite, and the squares of its gradients, which Adam keeps means of.
+        """Whether the losses of this step, and the squares of its gradients, of which Adam keeps means, are finite.
 
-        Where mixed precision scales the loss, gradients that overflow are the scaler's, who leaves them out.
+        With a scaled loss (mixed precision), GradScaler itself leaves out steps whose gradients overflow.
         """
         self.pipeline.stopwatch.lap("backward")
         numbers = list(self.pipeline.last_step.losses.values())
@@ -505,42 +495,48 @@ class EnerfTrainer(Trainer):
         return torch.stack([number.float() for number in numbers]).isfinite().all()
 
     def _look_at_skipped(self, step: int, seen: TrainStep) -> None:
-        """Counts a step that was left out, keeps the batch of the first, and gives up after some in a row."""
+        """Counts a step that was left out. Stores the batch of the first one, and ends training after `MOST_SKIPPED` in
+        a row.
+
+        Raises:
+            SystemExit: So many steps in a row were not finite; with one sentence.
+        """
         term = what_is_not_finite(seen, self.pipeline.model)
-        self.optimizers.zero_grad_all()  # of which some may be gathered over several steps
+        self.optimizers.zero_grad_all()  # since some groups accumulate gradients over several steps
         self.num_skipped += 1
         self._skipped_in_a_row += 1
         if self.num_skipped == 1 and is_main_process():
             file = self.base_dir / f"skipped-step-{step:09d}.pt"
             try:
                 keep_batch(seen, step, file)
+                kept = f"Its batch is stored in {file}"
             except OSError as error:
-                file = f"not kept ({error.strerror})"
-            say(f"Step {step} is left out, since {term} is not finite; its batch is {file}.")
+                kept = f"Its batch could not be stored ({error.strerror})"
+            say(f"Step {step} is left out, since {term} is not finite. {kept}.")
         if self._skipped_in_a_row == MOST_SKIPPED:
             raise SystemExit(
                 f"enerf: Training stopped at step {step}, since {term} is not finite, {MOST_SKIPPED} steps in a row; "
-                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate, and `enerf inspect` on the "
-                "recording."
+                f"the checkpoints in {self.checkpoint_dir} stay. Try a lower learning rate "
+                "(--optimizers.fields.optimizer.lr), and check the recording with `enerf inspect`."
             )
 
     def _look_at_learning(self, step: int) -> None:
-        """Says, once for each reason, that what is rendered is nothing."""
+        """Warns, once for each reason, that the field renders nothing."""
         found = why_nothing_is_learnt(self.pipeline.last_step, self.pipeline.model.sensor)
         for reason in found.keys() - self._found_wrong:
             self._found_wrong.add(reason)
             say(
                 f"Nothing is learnt at step {step}: {found[reason]}. Try a lower learning rate "
-                "(--optimizers.fields.optimizer.lr), and check --contrast-thresholds, --depth-range, and poses and "
-                "clock with `enerf inspect`."
+                "(--optimizers.fields.optimizer.lr), check --contrast-thresholds and --depth-range, and check poses "
+                "and clock with `enerf inspect`."
             )
 
     def _handle_signals(self) -> None:
         try:
             for number in (signal.SIGINT, signal.SIGTERM):
-                if signal.getsignal(number) != signal.SIG_IGN:  # as of a run in the background, which nobody interrupts
+                if signal.getsignal(number) != signal.SIG_IGN:  # a shell sets that for runs in the background
                     self._handlers[number] = signal.signal(number, self._interrupt) or signal.SIG_DFL
-        except ValueError:  # not in the main thread, to which alone signals come
+        except ValueError:  # outside the main thread, which alone receives signals
             pass
 
     def _restore_signals(self) -> None:
@@ -552,15 +548,15 @@ class EnerfTrainer(Trainer):
         if self._interrupted:
             raise SystemExit(130)
         self._interrupted = self.stop_training = True
-        say("Interrupted: this step is finished and a checkpoint stored; once more stops at once.")
+        say("Training is interrupted. It finishes this step and stores a checkpoint; a second signal stops it at once.")
 
     def _train_complete_viewer(self) -> None:
         self._restore_signals()
-        with suppress(KeyboardInterrupt):  # until which the viewer runs
+        with suppress(KeyboardInterrupt):  # which ends the viewer
             super()._train_complete_viewer()
 
     def _after_train(self) -> None:
-        self.step = self._trained  # where training was stopped, Nerfstudio has counted one further
+        self.step = self._trained  # Nerfstudio has counted one step more where training was stopped
         config = quoted(self.base_dir / "config.yml")
         if self._trained + 1 < self._start_step + self.config.max_num_iterations:
             if self._trained >= self._start_step:
@@ -573,25 +569,25 @@ class EnerfTrainer(Trainer):
         with without_chatter():
             super()._after_train()
         if self._unsaved:
-            raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and train on.")
+            raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and continue.")
         CONSOLE.rule("Training is done")
         self._say_skipped()
         learned = self.pipeline.model.sensor.learned()
         if learned:
             numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
-            say(f"The sensor as it was learned: {numbers}.")
+            say(f"Parameters of the sensor that were learned: {numbers}.")
         self._say_poses()
         for what, where in {
             "checkpoint": quoted(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
             "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
-            "video of your own": f"ns-render interpolate --load-config {config} --output-path video.mp4",
-            "look around": f"ns-viewer --load-config {config}",
+            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4",
+            "viewer": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)
 
     def _say_poses(self) -> None:
-        """Shows what of clock, poses and lens was found to be wrong, and stores it with the run."""
+        """Prints the errors that were found in clock, poses and lens, and stores them with the run."""
         refiner, manager = self.pipeline.poses, self.pipeline.datamanager
         if refiner is None or not refiner.looks:
             return
@@ -602,8 +598,9 @@ class EnerfTrainer(Trainer):
         except OSError as error:
             say(f"{self.base_dir / POSES_FILE} could not be written ({error.strerror}); make room.")
         if refiner.corrected:
-            say_where("poses as refined", f"enerf export poses {quoted(self.base_dir / 'config.yml')}")
+            say_where("refined poses", f"enerf export poses {quoted(self.base_dir / 'config.yml')}")
 
     def _say_skipped(self) -> None:
         if self.num_skipped:
-            say(f"{self.num_skipped} steps were left out, since they were not finite.")
+            steps = "1 step was" if self.num_skipped == 1 else f"{self.num_skipped} steps were"
+            say(f"{steps} left out, since losses or gradients were not finite.")

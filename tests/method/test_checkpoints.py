@@ -168,20 +168,6 @@ def test_no_folder_is_no_checkpoint_and_no_error(tmp_path: Path):
         newest_checkpoint(tmp_path)
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on(copy: Path):
-    """It holds no state of generators, no counters, and no length of the decay."""
-    file = copy / "nerfstudio_models/step-000000002.ckpt"
-    state = torch.load(file)
-    old = {name: state[name] for name in ("step", "pipeline", "optimizers", "schedulers", "scalers")}
-    assert len(old) < len(state)
-    torch.save(old, file)
-    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
-    config.max_num_iterations = 4
-    trainer = set_up(config)
-    trainer.train()
-    assert eval_setup(copy / "config.yml")[3] == 3
-
-
 @contextmanager
 def full_disk(largest: int) -> Iterator[None]:
     """No file of this process can become larger than so many bytes, which is refused as where a disk is full."""

@@ -110,7 +110,7 @@ def test_each_flag_of_the_pipeline_is_read(capsys: pytest.CaptureFixture[str]):
     settings = {flag.removeprefix("pipeline.").rpartition(".")[2] for flag in shown if flag.startswith("pipeline.")}
     settings |= {flag for flag in shown if hasattr(EventDataParserConfig(), flag)}
     assert {"supervision", "event_pairs", "num_levels", "held_out_every", "depth_range"} <= settings
-    assert settings - read - {"hidden_dim_color"} == set()  # the other spelling of hidden_dim_colour
+    assert settings - read == set()
     idle = {"masks_on_gpu", "images_on_gpu", "patch_size", "eval_image_indices", "prompt", "loss_coefficients"}
     assert not {flag for flag in shown if idle & set(flag.split("."))}
 

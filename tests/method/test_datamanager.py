@@ -11,7 +11,6 @@ import torch
 from small_runs import HEIGHT, WIDTH, set_up, small_config
 
 from enerf_ns.dataparsers.recording.files import load_image
-from enerf_ns.method.datamanager import EnerfDataManagerConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -170,14 +169,6 @@ def test_no_instant_that_is_paired_lies_in_what_is_held_out(recording: Path, tmp
     index, chosen = manager.index, slice(64, None)
     until = [index.count_until(events.pixels[chosen], times[chosen]) for times in (events.start, events.end)]
     assert torch.equal(until[1] - until[0], (events.on + events.off)[chosen])
-
-
-def test_a_run_from_before_any_instants_were_paired_pairs_none():
-    config = EnerfDataManagerConfig()
-    state = {name: value for name, value in vars(config).items() if name not in ("instant_pairs", "instants_apart_ms")}
-    before = EnerfDataManagerConfig.__new__(EnerfDataManagerConfig)
-    before.__setstate__(state)
-    assert before.instant_pairs == 0 and before.silent_pairs == config.silent_pairs
 
 
 def test_without_held_out_events_the_correlation_is_that_of_training_pairs(recording: Path, tmp_path: Path):

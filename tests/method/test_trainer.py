@@ -15,12 +15,10 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
 
-from enerf_ns.choices.resolver import MEAN_BRIGHTNESS
 from enerf_ns.choices.table import choices_table, recording_table
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.method import trainer as trainer_module
 from enerf_ns.method.config import enerf
-from enerf_ns.sensor.response import Linlog
 
 
 def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, monkeypatch):
@@ -101,28 +99,6 @@ def test_resuming_from_what_was_stored_prints_the_same_table(recording: Path, tm
     assert again_table == table
     assert "the recording" in table and "measured" not in table
     assert yaml.load(stored.read_text(), Loader=yaml.Loader) == again
-
-
-def test_a_config_from_before_choices_were_stored_apart_loads(recording: Path, tmp_path: Path):
-    """Its choices stand in the config itself, and its sensor is two thresholds of the model."""
-    config = small_config(recording, tmp_path, sensor__contrast_thresholds=(0.3, 0.2)).resolved()
-    old = config.pipeline.resolution.applied_to(config.pipeline)
-    text = yaml.dump(old)
-    state = yaml.load(text, Loader=yaml.Loader)
-    model = state.model.__dict__
-    model["contrast_thresholds"] = model.pop("sensor").contrast_thresholds
-    model["hidden_dim_color"] = model.pop("hidden_dim_colour") + 8
-    del model["contraction"], model["init_density"], model["mean_brightness"]
-    del state.__dict__["defaults"], state.__dict__["resolution"]
-    loaded = yaml.load(yaml.dump(state), Loader=yaml.Loader)
-    assert loaded.model.sensor.contrast_thresholds == (0.3, 0.2)
-    pipeline = loaded.setup(device="cpu", test_mode="test")
-    assert pipeline.model.sensor.contrast_thresholds == (0.3, 0.2)
-    assert pipeline.model.sensor.response == Linlog()
-    assert pipeline.config.model.hidden_dim_colour == old.model.hidden_dim_colour + 8
-    assert pipeline.config.model.max_res == old.model.max_res and pipeline.config.model.contraction is False
-    assert pipeline.config.model.init_density == 0.01 == pipeline.model.field.geometry.init_density
-    assert pipeline.config.model.mean_brightness == MEAN_BRIGHTNESS
 
 
 def test_without_data_it_says_which_flag_is_missing(tmp_path: Path):

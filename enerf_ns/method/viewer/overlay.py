@@ -1,4 +1,4 @@
-"""What the viewer draws over a render: events where surfaces saw them, brightness for the eye, depth in metres."""
+"""Pictures of the viewer: brightness encoded for a display, and events drawn on the surfaces that caused them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from enerf_ns.dataparsers.index.event_index import OFF_COLOUR, ON_COLOUR, EventI
 from enerf_ns.dataparsers.recording.camera import Camera
 
 EVENT_OPACITY = 0.75
-"""Share of an event's colour in that of the pixel it is drawn on."""
+"""Opacity of an event that is drawn on a pixel."""
 
 MOSTLY_EVENT = 96
-"""Of 255, how much of a pixel without distortion an event covers that is drawn there."""
+"""Least part of an undistorted pixel, of 255, that events must cover to be drawn there."""
 
 
 def for_the_eye(
@@ -23,22 +23,22 @@ def for_the_eye(
     """Brightness as a display shows it: doubled by each stop, to the power 1 / gamma, clipped to [0, 1].
 
     Args:
-        brightness: Rendered, from 0 on.
-        stops: Of exposure, of any sign.
-        gamma: Above 0; 1 leaves brightness linear.
-        share: Of each ray that surfaces stop, in [0, 1].
-        behind: Colour, shape (3,), of what is behind them.
+        brightness: Rendered brightness, 0 or more.
+        stops: Stops of exposure, of any sign.
+        gamma: Exponent above 0; with 1, brightness stays linear.
+        share: Accumulation of each ray, in [0, 1].
+        behind: Colour of the background, shape (3,).
     """
     seen = (brightness * 2.0**stops).clamp(0.0, 1.0) ** (1.0 / gamma)
     return (seen + (1.0 - share) * behind).clamp(max=1.0)
 
 
 def recent_events(index: EventIndex, camera: Camera, first: int, last: int) -> UInt8[np.ndarray, "height width 2"]:
-    """Where a sensor's pixels became brighter, and where darker, after a time and until another (ns).
+    """The pixels with events between two times (ns), after the first and up to the last.
 
     Returns:
-        255 at pixels whose events are more often positive than negative, and at those where it is the other way round
-        or even; 0 elsewhere. As the camera without distortion sees it, where values between are edges.
+        Two undistorted pictures. The first is 255 at pixels with more positive than negative events, the second at all
+        other pixels with events. Values between 0 and 255 are edges of pixels, from the undistortion.
     """
     pixels = torch.arange(camera.width * camera.height, device=index.times.device)
     begin, end = (index.offsets[pixels] + index.count_until(pixels, torch.full_like(pixels, t)) for t in (first, last))
@@ -56,14 +56,14 @@ def draw_events(
     camera: Camera,
     scene_from_camera: Float64[np.ndarray, "3 4"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Colours of points, with those of the events of a camera that sees them, whether something lies between or not.
+    """Colours of points, with the events of a camera drawn on them. Occlusion is ignored.
 
     Args:
-        rgb: In [0, 1].
-        points: In the scene.
-        events: As of `recent_events`.
-        camera: Without distortion.
-        scene_from_camera: Its pose in the scene, OpenCV axes.
+        rgb: Colours of the points, in [0, 1].
+        points: Points in the scene, scene units.
+        events: Pictures of `recent_events`.
+        camera: Camera of the events, without distortion.
+        scene_from_camera: Pose of the camera in the scene, OpenCV axes.
     """
     pose = torch.from_numpy(scene_from_camera).to(points)
     x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(-1)

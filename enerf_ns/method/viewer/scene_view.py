@@ -1,4 +1,4 @@
-"""The viewer on a recording: where it opens, the recorded trajectory to play along, and what is drawn over renders."""
+"""Nerfstudio's viewer adapted to a recording: its first view, its trajectory to play along, events over renders."""
 
 from __future__ import annotations
 
@@ -21,57 +21,57 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.datamanager import EnerfDataManager
 from enerf_ns.method.model import EnerfModel, Outputs
+from enerf_ns.method.nerfstudio_seams import replace_camera_callbacks, replace_renderer, tidy_control_panel
 from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events
 from enerf_ns.method.viewer.seen_rays import SeenRays
 from enerf_ns.method.viewer.view_renderer import ViewRenderer
 
 LOOK_WIDTH = 64
-"""Pixels of the picture from which the depth before the first view is measured."""
+"""Width in pixels of the picture from which the depth of the first view is measured."""
 
 BEHIND = 0.2
-"""Distance of the first view behind its training camera, as a share of the depth of the scene before that."""
+"""Distance of the first view behind its training camera, as a share of the depth of the scene."""
 
 FRUSTUM = 0.006
-"""Scale of a camera that is drawn, as a share of the same depth; it is then drawn about three times as wide."""
+"""Scale of the cameras that are drawn, as a share of the same depth; they are about three times as wide."""
 
 MOST_CAMERAS = 16
-"""Training cameras that are drawn."""
+"""Number of training cameras that are drawn."""
 
 FULL_WIDTH = 640
-"""Longer side, in pixels, of the picture of a view that rests; "Max res" in the viewer."""
+"""Longer side, in pixels, of the picture of a view at rest; "Max res" in the viewer."""
 
 MIDDLE_BRIGHTNESS = 0.4
-"""What the median of the first view is shown as, where events alone were learnt from."""
+"""Displayed value of the median of the first view, if the field learns from events alone."""
 
 PATH_POINTS = 200
-"""Points of the trajectory that is drawn."""
+"""Number of points of the drawn trajectory."""
 
 PLAY_SECONDS = 10.0
-"""What playing takes at least; longer recordings play as fast as they were recorded."""
+"""Least time in which a recording is played; longer recordings are played in real time."""
 
 PLAY_STEP = 0.125
-"""Seconds from one view that is played to the next."""
+"""Seconds between two views while playing."""
 
 FIRST_SEEN, SEEN_EVERY = 500, 1.5
-"""Step of a training that is watched after which it is known what was seen, and factor from one such step to the
-next."""
+"""Step of a training at which the seen volume is first computed, and factor from one such step to the next."""
 
 LOOKED_EVERY = 1.1
-"""Factor from one step of a training that is watched, at which it is looked how bright the field is, to the next."""
+"""Factor from one step of a training at which the brightness of the field is measured to the next."""
 
 ACCENT = (255, 211, 105)
 """Colour of the trajectory and the sensor."""
 
 STATED = (150, 150, 150)
-"""Colour of the trajectory as it was stated, where it was corrected."""
+"""Colour of the trajectory before corrections."""
 
 
 class SceneView(ViewerControl):
-    """Makes a viewer of Nerfstudio's one on a recording, when it starts (`_setup`).
+    """Adapts Nerfstudio's viewer to a recording when the viewer starts (`_setup`).
 
     Args:
-        model: That the viewer shows.
-        manager: Of what it learns from.
+        model: The model that the viewer shows.
+        manager: The data manager of its recording.
     """
 
     def __init__(self, model: EnerfModel, manager: EnerfDataManager):
@@ -96,11 +96,11 @@ class SceneView(ViewerControl):
 
     @property
     def _recording(self) -> EventRecording:
-        """With the poses as they are corrected by now."""
+        """The recording, with its current corrections."""
         return self._manager.recording
 
     def _look_from_the_middle(self) -> None:
-        """Finds the first view: what lies before the camera that is the middle one in time, and at which depth."""
+        """Finds the first view, which is that of the middle camera in time, and its depth."""
         dataset, model = self._manager.train_dataset, self._model
         self._middle = int(np.argsort(dataset.frames.times)[len(dataset) // 2])
         camera = dataset.cameras[self._middle : self._middle + 1].to(model.device)
@@ -114,30 +114,27 @@ class SceneView(ViewerControl):
         self._up = dataset.cameras.camera_to_worlds[:, :3, 1].double().mean(dim=0).numpy()
 
     def _look(self) -> Tensor:
-        """Depth of the first view as the field is now, scene units; notes how bright that view is."""
+        """Depth of the first view of the current field, scene units. Also measures the brightness of that view."""
         model, was_training = self._model, self._model.training
         outputs = model.eval().get_outputs_for_camera(self._look_camera)
         model.train(was_training)
-        if self._manager.config.supervision == "events":  # which leave the level of brightness open
+        if self._manager.config.supervision == "events":  # which do not determine the level of brightness
             self._level = float(np.log2(MIDDLE_BRIGHTNESS / outputs["rgb"].median().clamp(min=1e-6).cpu()))
         return outputs["depth"]
 
     def _tidy_up(self) -> None:
-        """Sizes that suit the scene, where none are set; and nothing to press that changes nothing."""
-        viewer, panel, defaults = self.viewer, self.viewer.control_panel, ViewerConfig()
+        """Sets sizes that suit the scene, unless the user did, and hides controls without effect."""
+        viewer, defaults = self.viewer, ViewerConfig()
         if viewer.config.camera_frustum_scale == defaults.camera_frustum_scale:
             viewer.config.camera_frustum_scale = FRUSTUM * self._depth * VISER_NERFSTUDIO_SCALE_RATIO
         if viewer.config.max_num_display_images == defaults.max_num_display_images:
             viewer.config.max_num_display_images = MOST_CAMERAS
-        panel._max_res.value = FULL_WIDTH
-        panel._crop_handle.visible = False  # until a crop is enabled
-        panel._train_speed.set_hidden(True)  # these set max res, and what nothing reads
-        panel._train_util.set_hidden(True)
+        tidy_control_panel(viewer.control_panel, FULL_WIDTH)
         if viewer.trainer is None:
             viewer.pause_train.visible = viewer.resume_train.visible = False
 
     def _draw_recording(self) -> None:
-        """The trajectory, and the sensor on it."""
+        """Draws the trajectory, and the sensor on it."""
         self._drawn = [
             self.viser_server.scene.add_frame("/cameras", show_axes=False),
             self.viser_server.scene.add_frame("/recording", show_axes=False),
@@ -152,7 +149,7 @@ class SceneView(ViewerControl):
         )
 
     def _draw_path(self) -> None:
-        """The trajectory as it is corrected by now, and in grey as it was stated, where that is another one."""
+        """Draws the trajectory with its current corrections, and in grey the stated one if it differs."""
         recording, self._path_of = self._recording, self._manager.corrections
         times = recording.instants(PATH_POINTS)
         self._path = np.stack([self._pose(int(t))[:, 3] for t in times])
@@ -177,14 +174,14 @@ class SceneView(ViewerControl):
             self._time = gui.add_slider("Time (s)", first, last, step, begin, hint="A moment of the recording")
             self._plays = gui.add_checkbox("Play", False, hint="Move along the trajectory, over and over")
             self._follows = gui.add_checkbox("Follow", True, hint="Look from where the sensor was at that moment")
-            self._events = gui.add_checkbox("Events", False, hint="Of the sensor at that moment, on what it saw")
-            self._window = gui.add_slider("Last (ms)", 1, 100, 1, 10, hint="Events up to so long before are drawn")
+            self._events = gui.add_checkbox("Events", False, hint="Draw the events of that moment on the surfaces")
+            self._window = gui.add_slider("Last (ms)", 1, 100, 1, 10, hint="Time before the moment with drawn events")
             self._stops = gui.add_slider("Brightness", -4.0, 4.0, 0.1, 0.0, hint="Stops; each doubles the brightness")
             self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
             self._depths = gui.add_markdown("")
             self._corrected = gui.add_markdown(self._corrections_in_words)
         for handle in (self._events, self._window, self._stops, self._gamma):
-            handle.on_update(lambda _: self.viewer._trigger_rerender())
+            handle.on_update(lambda _: self._render())
         self._time.on_update(lambda _: self._move())
         self._follows.on_update(lambda _: self._move())
         self._plays.on_update(lambda _: threading.Thread(target=self._play, daemon=True).start())
@@ -192,21 +189,17 @@ class SceneView(ViewerControl):
 
     def _open(self, client: viser.ClientHandle) -> None:
         """Shows a browser the first view, and renders for it from now on."""
-        own = self.viewer.render_statemachines[client.client_id]
-        own.running = False
-        own.render_trigger.set()  # so that it ends before it has rendered anything
         renderer = ViewRenderer(self.viewer, client, self._rays_per_second, self._limit, self._shown)
-        self.viewer.render_statemachines[client.client_id] = renderer
+        replace_renderer(self.viewer, client, renderer)
         pose = self._manager.train_dataset.cameras.camera_to_worlds[self._middle].cpu().double().numpy()
         back = pose[:, 2]
         self._turn(client, pose[:, 3] + BEHIND * self._depth * back, pose[:, 3] - self._depth * back, self._up)
-        client.camera._state.camera_cb.clear()  # of Nerfstudio's callback, for which see ours
-        client.camera.on_update(self._moved)
+        replace_camera_callbacks(client, self._moved)
         self.viewer.update_step(self.viewer.step)
         renderer.start()
 
     def _turn(self, client: viser.ClientHandle, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-        """Has a browser look from a place in the scene to another."""
+        """Moves the camera of a browser to a position, and points it at a target."""
         with client.atomic():
             self._fit(client.camera)
             client.camera.up_direction = up
@@ -214,19 +207,25 @@ class SceneView(ViewerControl):
             client.camera.look_at = target * VISER_NERFSTUDIO_SCALE_RATIO
 
     def _moved(self, view: viser.CameraHandle) -> None:
-        """Renders for a browser that says where it is.
-
-        Handles are heard in threads of their own, so that it may have gone since. Nerfstudio's own callback then fails
-        with viser's lock in hand, which nobody gives back: no message is sent any more, and Python does not end.
-        """
-        renderer = self.viewer.render_statemachines.get(view.client.client_id)
-        if renderer is not None:
+        """Renders for a browser whose camera has moved, unless it has gone since."""
+        if view.client.client_id in self.viewer.render_statemachines:
             self._fit(view)
             self.viewer.last_move_time = time.time()  # type: ignore - starts as an int
-            renderer.action(RenderAction("move", self.viewer.get_camera_state(view.client)))
+            self._render_for(view.client)
+
+    def _render(self) -> None:
+        """Renders anew for all browsers."""
+        for client in self.viser_server.get_clients().values():
+            self._render_for(client)
+
+    def _render_for(self, client: viser.ClientHandle) -> None:
+        """Renders anew for a browser, unless it has gone since: handles are heard in threads of their own."""
+        renderer = self.viewer.render_statemachines.get(client.client_id)
+        if renderer is not None:
+            renderer.action(RenderAction("move", self.viewer.get_camera_state(client)))
 
     def _fit(self, view: viser.CameraHandle) -> None:
-        """Has a view show all that the sensor sees, also where panels make it narrow."""
+        """Widens a view until it shows the whole picture of the sensor, also where panels make it narrow."""
         camera = self._camera
         half = 0.5 * max(camera.height / camera.fy, camera.width / camera.fx / view.aspect)
         fov = 2.0 * float(np.arctan(half))
@@ -239,7 +238,7 @@ class SceneView(ViewerControl):
         return f"Corrected: {'; '.join(words)}. Grey: the path as it was stated." if words else ""
 
     def _pose(self, time_ns: int, trajectory: Trajectory | None = None) -> Float64[np.ndarray, "3 4"]:
-        """The sensor in the scene, OpenCV axes, on its own trajectory or on another one."""
+        """The pose of the sensor in the scene, OpenCV axes, on its own trajectory or on another one."""
         pose = (trajectory or self._recording.trajectory).poses(torch.tensor(time_ns)).numpy()
         rotation, shift = self._transform[:, :3], self._transform[:, 3]
         return np.column_stack([rotation @ pose[:, :3], self._scale * (rotation @ pose[:, 3] + shift)])
@@ -251,9 +250,9 @@ class SceneView(ViewerControl):
         return min(max(round(self._time.value * 1e9), first), last)
 
     def _move(self) -> None:
-        """Puts the sensor where it was at the time of the slider, and the views with it.
+        """Moves the sensor to its pose at the time of the slider, and the views with it.
 
-        Handles are heard in threads of their own: one at a time, so that the last ends with the time as it then is.
+        viser calls this in several threads. The lock makes them wait, so that the last one sets the latest time.
         """
         with self._moves:
             pose = self._pose(self._moment)
@@ -263,10 +262,10 @@ class SceneView(ViewerControl):
             if self._follows.value:
                 for client in self.viser_server.get_clients().values():
                     self._turn(client, pose[:, 3], pose[:, 3] + self._depth * pose[:, 2], -pose[:, 1])
-        self.viewer._trigger_rerender()
+        self._render()
 
     def _play(self) -> None:
-        """Moves the time on for as long as it is to play; from the end it goes on at the start."""
+        """Advances the time until "Play" is switched off. After the end it starts again."""
         first, last = np.array(self._recording.span) * 1e-9
         step = PLAY_STEP * min(1.0, (last - first) / PLAY_SECONDS)
         while self._plays.value:
@@ -279,12 +278,11 @@ class SceneView(ViewerControl):
         return SeenRays(self._model.seen_volume())
 
     def _limit(self, rays: RayBundle, at_rest: bool) -> None:
-        """Has rays of a picture begin and end where something was seen, as far as that is known; finds out anew what
-        training has changed since.
+        """Limits the rays of a picture to the seen volume, and updates what training has changed.
 
         Args:
-            rays: Shape (height, width); with nears and fars where they are to stay between these.
-            at_rest: There is time to find out what was seen.
+            rays: Rays of shape (height, width); nears and fars that are set are only narrowed.
+            at_rest: Whether the view rests, so that there is time to compute the seen volume.
         """
         step, model = self.viewer.step, self._model
         if self.viewer.trainer is not None and step >= LOOKED_EVERY * self._looked_at:
@@ -304,11 +302,11 @@ class SceneView(ViewerControl):
         rays.nears, rays.fars = nears, fars
 
     def _shown(self, outputs: Outputs, rays: RayBundle) -> Outputs:
-        """What the panel makes of what was rendered: rgb for the eye, with events; depth in metres.
+        """The outputs that are shown: rgb encoded for a display, with events, and depth in metres.
 
         Args:
-            outputs: Of the model, each of shape (height, width, its size).
-            rays: Of the picture, shape (height, width).
+            outputs: Outputs of the model, each of shape (height, width, channels).
+            rays: Rays of the picture, shape (height, width).
         """
         rgb, depth, share = outputs["rgb"], outputs["depth"], outputs["accumulation"]
         points = rays.origins + rays.directions * depth
@@ -325,12 +323,12 @@ class SceneView(ViewerControl):
         shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, share > 0.5)})
         path = torch.from_numpy(self._path).to(rays.origins)
         away = float((path - rays.origins[0, 0]).norm(dim=-1).min())
-        for handle in self._drawn:  # on the trajectory, it and the cameras are in the way
+        for handle in self._drawn:  # near the trajectory, drawn lines and cameras hide the scene
             handle.visible = away > 4.0 * FRUSTUM * self._depth
         return shown
 
     def _in_metres(self, depth: Tensor, is_known: Tensor) -> Tensor:
-        """Depth in metres within what is known of the view, which is told."""
+        """Depth in metres, clipped to the known depths of the view. Also updates the text about depths."""
         metres = depth / self._scale
         known, (row, column) = metres[is_known], (side // 2 for side in metres.shape[:2])
         content = "Nothing was seen here."

@@ -1,4 +1,4 @@
-"""Parts of rays in which something was seen, so that a picture shows no fog where nobody looked."""
+"""The parts of rays that the camera of the events saw, so that a picture shows no fog where it never looked."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from torch import Tensor
 from enerf_ns.rendering.seen_volume import SeenVolume
 
 COARSE = 80
-"""Rays along the longer side of a picture of which it is found out; those between are taken as their neighbours."""
+"""Number of rays along the longer side of a picture that are computed; rays between take the value of a neighbour."""
 
 PLACES = 96
-"""Places on a ray through the box that are looked at; a step is about a voxel."""
+"""Number of points on a ray through the box that are tested; their distance is about a voxel."""
 
 NOWHERE = 1e9
-"""Distance at which a ray begins and ends on which nothing was seen."""
+"""Distance at which a ray begins and ends if nothing was seen on it."""
 
 
 class SeenRays:
-    """Says of rays where they pass what was seen.
+    """Computes the part of a ray that lies in the seen volume.
 
-    Surfaces are rendered a little nearer or farther from another side: they may lie in voxels that touch a seen one.
+    A surface is rendered a little nearer or farther from another side, so that it may lie in a voxel that touches a
+    seen one.
 
     Args:
-        seen: What was seen.
+        seen: The volume that the camera of the events saw.
     """
 
     def __init__(self, seen: SeenVolume):
@@ -35,17 +36,20 @@ class SeenRays:
         self._around = replace(seen, is_seen=padded[0] > 0.0)
 
     def may_be_surface(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Whether points (scene units) lie in voxels that were seen, or in ones that touch such."""
+        """Whether points (scene units) lie in seen voxels, or in voxels that touch seen ones."""
         return self._around.seen(points)
 
     def span(
         self, origins: Float[Tensor, "height width 3"], directions: Float[Tensor, "height width 3"]
     ) -> tuple[Float[Tensor, "height width 1"], Float[Tensor, "height width 1"]]:
-        """Distances from which on rays of a picture pass voxels that were seen, or somewhat before, and up to which
-        surfaces may be, or somewhat after; both `NOWHERE` where they pass none.
+        """Near and far distances between which the rays of a picture pass seen voxels, with some margin.
 
         Args:
-            origins, directions: Of the rays; directions of length 1.
+            origins: Origins of the rays, scene units.
+            directions: Directions of the rays, of length 1.
+
+        Returns:
+            Two tensors in scene units; both are `NOWHERE` for rays that pass no seen voxel.
         """
         height, width = origins.shape[:2]
         step = -(-max(height, width) // COARSE)

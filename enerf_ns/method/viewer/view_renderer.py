@@ -1,4 +1,4 @@
-"""When the viewer renders, and how large: at once and small while it moves, whole as soon as it rests."""
+"""Rendering for a browser: small pictures at once while its view moves, a large one as soon as it rests."""
 
 from __future__ import annotations
 
@@ -21,25 +21,27 @@ from viser import ClientHandle
 from enerf_ns.method.model import EnerfModel, Outputs
 
 MOVING_SECONDS = 0.1
-"""What a picture may take while the view moves."""
+"""Time (s) that a picture may take while the view moves."""
 
 SMALLEST_WIDTH = 160
-"""Pixels; a picture is never narrower, however long it takes."""
+"""Least width of a picture in pixels, however long it takes."""
 
 SECONDS_TO_ARRIVE = 2.0
-"""Time after connecting in which a browser may still tell of the place at which it opens by itself."""
+"""Time after connecting in which a browser may still report the pose at which it opens by itself."""
 
 
 class ViewRenderer(RenderStateMachine):
-    """Renders for one browser; Nerfstudio's own shows 47 x 30 pixels while the view moves, and the same once more when
-    it rests, before it renders the whole picture.
+    """Renders for one browser.
+
+    Nerfstudio's own class shows 47 x 30 pixels while the view moves, and the same once more when it rests, before it
+    renders the whole picture.
 
     Args:
-        viewer: Of Nerfstudio.
-        client: The browser, where it opened by itself.
-        rays_per_second: As measured so far.
-        limit: Sets where rays of a picture begin and end; is told whether the view rests.
-        shown: Makes of outputs, and of the rays that they are of, what is shown.
+        viewer: Nerfstudio's viewer.
+        client: The browser, at the pose at which it opened by itself.
+        rays_per_second: Measured speed of rendering.
+        limit: Sets near and far ends of the rays of a picture; its second argument says whether the view rests.
+        shown: Returns the outputs that are shown, from the outputs of the model and their rays.
     """
 
     def __init__(
@@ -62,10 +64,10 @@ class ViewRenderer(RenderStateMachine):
             super().action(action)
 
     def _render_img(self, camera_state: CameraState) -> Outputs:
-        """What the model shows of a view, and what the panel makes of it; rays are made once for both."""
+        """The outputs of the model for a view, changed as the panel says. The rays are made once for both."""
         panel, model = self.viewer.control_panel, self.viewer.get_model()
         assert isinstance(model, EnerfModel)
-        if self.state != "high":  # Nerfstudio interrupts the first picture of a move for one that was done before it
+        if self.state != "high":  # else the first picture of a move is interrupted, for one that was finished before
             self.interrupt_render_flag = False
         height, width = self._calculate_image_res(camera_state.aspect)
         camera = get_camera(camera_state, height, width).to(model.device)
