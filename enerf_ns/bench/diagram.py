@@ -7,7 +7,7 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
 from enerf_ns.bench.tables import Line, Results, lines
-from enerf_ns.report.figures import GREY, WIDTH, style
+from enerf_ns.report.figures import GREY, WIDTH, plain, style
 from enerf_ns.report.trade_offs import pareto_front
 
 if TYPE_CHECKING:
@@ -51,6 +51,5 @@ def _plot(axis: Axes, found: list[Line]) -> None:
     front = sorted(point for point, is_best in zip(means, best, strict=True) if is_best)
     axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1, label="Pareto front")
     axis.set(xlabel="training, s", ylabel="PSNR, dB")
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
+    plain(axis)
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS, Published
+from enerf_ns.dataparsers.recording.files import write_whole
+
+if TYPE_CHECKING:
+    from enerf_ns.simulator.settings import SimulationSettings
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,27 @@ class Sequence:
     """Settings of the simulated sensor, of which the recording then states nothing. None: ideal, and stated."""
     files: Mapping[str, str] = field(default_factory=dict)
     """Text by the names of the files that scene and key_frames name."""
+
+    def simulation_settings(self, folder: Path, **changes: Any) -> SimulationSettings:
+        """Settings of the simulation of this sequence, whose scene and key frames are written into a folder.
+
+        Args:
+            folder: Made if it does not exist.
+            changes: Settings that take the place of those of the sequence.
+
+        Raises:
+            OSError: The folder cannot be written to.
+        """
+        from enerf_ns.simulator.event_sensor import SensorSettings
+        from enerf_ns.simulator.settings import SimulationSettings
+
+        for name, content in self.files.items():
+            write_whole(folder / name, content)
+        given = {"scene": self.scene, "sensor": SensorSettings(**(self.sensor or {})), **self.simulation, **changes}
+        for name in ("scene", "key_frames"):
+            if given.get(name) in self.files:
+                given[name] = folder / given[name]
+        return SimulationSettings(**{**given, "scene": str(given["scene"])})
 
 
 @dataclass(frozen=True)

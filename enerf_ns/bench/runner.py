@@ -38,7 +38,6 @@ from enerf_ns.method.stopwatch import seconds_of
 from enerf_ns.method.trainer import EnerfTrainerConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
-from enerf_ns.simulator.settings import SimulationSettings
 
 FULL_SIZE = (640, 480)
 """Width and height of the simulated sequences at scale 1, pixels."""
@@ -320,16 +319,10 @@ class Bench:
             recording = self.output_dir / "recordings" / f"{stem}-{_digest([simulation, sequence.files])}"
             with _made_whole(recording) as folder:
                 if folder is not None:
-                    given: dict[str, Any] = {
-                        name: str(self._file(value, sequence.files[value]))
-                        if isinstance(value, str) and value in sequence.files
-                        else value
-                        for name, value in simulation.items()
-                    }
-                    if "key_frames" in given:
-                        given["key_frames"] = Path(given["key_frames"])
-                    given["sensor"] = SensorSettings(**(sequence.sensor or {}))
-                    simulate(SimulationSettings(**given), folder)
+                    size = {name: simulation[name] for name in ("width", "height")}
+                    with self._writing_to(recording.parent):
+                        settings = sequence.simulation_settings(recording.parent, **size)
+                    simulate(settings, folder)
                     if sequence.sensor is not None:
                         hide_sensor(folder)
         if row.reconstruction is None:
@@ -345,14 +338,14 @@ class Bench:
                 reconstruct(recording, folder, weights and expanded(weights))
         return frames
 
-    def _file(self, name: str, content: str) -> Path:
-        path = self.output_dir / "recordings" / name
-        self._write(path, content)
-        return path
-
     def _write(self, path: Path, content: str | bytes) -> None:
-        try:
+        with self._writing_to(path):
             write_whole(path, content)
+
+    @contextlib.contextmanager
+    def _writing_to(self, path: Path) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise OutputError(
                 f"{path} could not be written ({error.strerror}); make room, or give another --output-dir."

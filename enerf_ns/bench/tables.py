@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 from statistics import mean, stdev
 from typing import Any
 
-from rich.markup import escape
-from rich.table import Table
-
 from enerf_ns.bench.numerics.case import shown
 from enerf_ns.bench.published import MEAN
+from enerf_ns.report.tables import NONE, Table, csv_text
 
 Results = dict[str, Any]
 """What a result file holds (`Bench.results`)."""
@@ -132,19 +128,18 @@ def changes_since(results: Results, before: Results) -> list[Change]:
 
 
 def changes_table(changes: list[Change], file: str) -> Table:
-    """The table of `changes_since` for the terminal."""
-    table = Table(title=f"PSNR against {escape(file)}, worst first", title_justify="left")
-    for name in ("sequence", "row", "before, dB", "now, dB", "change"):
-        table.add_column(name, justify="left" if name in ("sequence", "row") else "right")
+    """The changes since the results in a file, as `changes_since` orders them."""
+    rows = []
     for change in changes:
         mark = f"  more than {LARGEST_LOSS:g} dB lost" * change.loses
         numbers = f"{change.before:.2f}", f"{change.now:.2f}", f"{change.now - change.before:+.2f}{mark}"
-        table.add_row(escape(change.sequence), escape(change.row), *numbers)
-    return table
+        rows.append([change.sequence, change.row, *numbers])
+    header = ["sequence", "row", "before, dB", "now, dB", "change, dB"]
+    return Table(f"PSNR against {file}, largest loss first", header, rows, num_words=2)
 
 
-def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
-    """Head of the table, and its lines."""
+def scores_table(results: Results) -> Table:
+    """The scores of all rows and sequences beside the published ones."""
     table, columns = lines(results), results["columns"]
     theirs = [name for name in columns if any(name in line.published for line in table)]
     several = len(results["protocols"]) > 1
@@ -155,11 +150,11 @@ def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
         cells += [_score(name, line.scores.get(name, [])) + _truth(name, line) for name in columns]
-        cells += [f"{mean(line.seconds):.0f}" if line.seconds else "-"]
-        cells += [f"{mean(line.steps):.0f}" if line.steps else "-"]
-        cells += [_published(name, line.published[name]) if name in line.published else "-" for name in theirs]
+        cells += [f"{mean(line.seconds):.0f}" if line.seconds else NONE]
+        cells += [f"{mean(line.steps):.0f}" if line.steps else NONE]
+        cells += [_published(name, line.published[name]) if name in line.published else NONE for name in theirs]
         content.append(cells)
-    return head, content
+    return Table(f"{results['experiment']}: {results['sentence']}", head, content, num_words=2)
 
 
 def _title(name: str) -> str:
@@ -168,7 +163,7 @@ def _title(name: str) -> str:
 
 def _score(name: str, values: list[float]) -> str:
     if not values:
-        return "-"
+        return NONE
     digits = DIGITS.get(name, 3)
     spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{mean(values):.{digits}f}{spread}"
@@ -246,50 +241,33 @@ def remarks(results: Results) -> Iterator[str]:
 
 def markdown(results: Results) -> str:
     """The command, the table and what belongs to it."""
-    head, content = _cells(results)
-    tables = [
-        _printed(head, content),
-        *([_printed(*_parts(results))] if any("parts" in run for run in results["runs"]) else []),
-    ]
-    return "\n\n".join([f"    {results['command']}", *tables, "".join(f"* {remark}\n" for remark in remarks(results))])
+    tables = [scores_table(results)]
+    if any("parts" in run for run in results["runs"]):
+        tables.append(_parts_table(results))
+    about = "".join(f"* {remark}\n" for remark in remarks(results))
+    return "\n\n".join([f"    {results['command']}", *(table.markdown() for table in tables), about])
 
 
-def _printed(head: list[str], content: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *content])
-
-
-def _parts(results: Results) -> tuple[list[str], list[list[str]]]:
-    """Head and lines of the numerical errors of the parts of each run; of one seed of each row and sequence."""
+def _parts_table(results: Results) -> Table:
+    """The numerical errors of the parts of each run, for the first seed of each row and sequence."""
     runs = [run for run in results["runs"] if run["seed"] == 0 and "parts" in run]
     lines: dict[tuple[str, str, str], list[str]] = {}
     for place, run in enumerate(runs):
         for part in run["parts"]:
             kind = part["name"], part["compared"], part["unit"].partition(" at ")[0]
-            lines.setdefault(kind, ["-"] * len(runs))[place] = shown(part["error"], part["unit"])
+            lines.setdefault(kind, [NONE] * len(runs))[place] = shown(part["error"], part["unit"])
     head = ["part", "compared with", *(f"{run['sequence']}, {run['row']}" for run in runs)]
-    return head, [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
-
-
-def rich_table(results: Results) -> Table:
-    """The table for the terminal."""
-    head, content = _cells(results)
-    table = Table(title=f"{results['experiment']}: {results['sentence']}", title_justify="left")
-    for number, name in enumerate(head):
-        table.add_column(name, justify="left" if number < 2 else "right")
-    for cells in content:
-        table.add_row(*map(escape, cells))
-    return table
+    rows = [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
+    return Table("Numerical error of the parts", head, rows, num_words=2)
 
 
 def csv_table(results: Results) -> str:
     """A line for each run and protocol, with all its scores."""
     runs = [run for run in results["runs"] if "failure" not in run]
     names = dict.fromkeys(name for run in runs for scores in run["scores"].values() for name in scores)
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["sequence", "row", "seed", "protocol", "steps", "seconds", *names])
+    table = [["sequence", "row", "seed", "protocol", "steps", "seconds", *names]]
     for run in runs:
         for protocol, scores in run["scores"].items():
             about = [run["sequence"], run["row"], run["seed"], protocol, run["steps"], run["seconds"]]
-            writer.writerow([*about, *(scores.get(name, "") for name in names)])
-    return table.getvalue()
+            table.append([*about, *(scores.get(name, "") for name in names)])
+    return csv_text(table)

@@ -70,6 +70,12 @@ def style(number: int) -> dict[str, Any]:
     }
 
 
+def plain(axis: Axes) -> None:
+    """Gives a plot a light grid, and no frame above and on the right."""
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
 def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) -> Figure | None:
     """Each score that any run has against training time or steps, on a logarithmic axis; None where no run has any.
     Where any run has frames, the correlation stands for all scores of events.
@@ -93,8 +99,7 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
                 look = style(number) | (FINAL if final else {"markersize": 4})
                 axis.plot([getattr(row, axis_of) for row in chosen], [row.scores[name] for row in chosen], **look)
         axis.set_ylabel(SCORES[name])
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
     _logarithmic(axes[-1], "x", [getattr(row, axis_of) for row in drawn])
     axes[-1].set_xlabel("training time, s (log)" if axis_of == "seconds" else "training steps (log)")
     few = {row.num_frames for row in drawn if not row.final and row.num_frames}
@@ -137,9 +142,8 @@ def work_precision(runs: Sequence[Curve]) -> Figure | None:
         axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1)
         axis.plot(*zip(*front, strict=True), "o", markersize=17, fillstyle="none", color=GREY, zorder=2)
         axis.set_ylabel(f"{label} (log)")
-        axis.grid(alpha=0.3)
         axis.margins(0.12)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
         _logarithmic(axis, "y", [cost[1] for cost in costs])
         if name == "psnr":
             decibels = axis.secondary_yaxis("right", functions=(psnr_of, rms_error))

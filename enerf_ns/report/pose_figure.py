@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.recording.recording import EventRecording
-from enerf_ns.report.figures import COLOURS, GREY, WIDTH
+from enerf_ns.report.figures import COLOURS, GREY, WIDTH, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,6 +52,5 @@ def corrections_over_time(recording: EventRecording) -> Figure | None:
     others[1].sharex(others[0])
     others[1].set_xlabel("time, s")
     for axis in (path, *others):
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
     return figure

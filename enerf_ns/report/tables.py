@@ -1,36 +1,58 @@
-"""Tables of runs: on a page, in Markdown, in the terminal; and their histories as CSV."""
+"""One kind of table for reports, benchmarks and checks, and the tables of runs."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
+
+from rich.markup import escape
+from rich.table import Table as RichTable
 
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.report.figures import AT_END, SCORES
 from enerf_ns.report.trade_offs import seconds_to_reach
 
 NONE = "-"
-"""Cell of what there is not."""
+"""Cell without a value."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Words and numbers in rows."""
+    """A table that is shown as Markdown, in a terminal, or on a page (`report.html`)."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
-    """What there is to know about it."""
+    """Sentences that explain the table."""
+    num_words: int = 1
+    """Number of columns, from the left, that hold words; the others hold numbers."""
 
     def markdown(self) -> str:
         """The table in Markdown, without its title."""
         lines = [self.header, ["---"] * len(self.header), *self.rows]
         cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
         return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+    def rich(self) -> RichTable:
+        """The table for the terminal."""
+        table = RichTable(title=escape(self.title), caption=escape(self.note), title_justify="left",
+                          caption_justify="left")  # fmt: skip
+        for number, name in enumerate(self.header):
+            table.add_column(escape(name), justify="left" if number < self.num_words else "right")
+        for row in self.rows:
+            table.add_row(*map(escape, row))
+        return table
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Rows as the text of a CSV file."""
+    content = io.StringIO()
+    csv.writer(content, lineterminator="\n").writerows(rows)
+    return content.getvalue()
 
 
 def score_cell(name: str, value: object) -> str:
@@ -82,12 +104,9 @@ def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
     optional = ("lpips_vgg", *AT_END)
     scores = [name for name in SCORES if name not in optional or any(name in row.scores for _, row in rows)]
     losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
-    content = io.StringIO()
-    writer = csv.writer(content, lineterminator="\n")
-    writer.writerow(["run", "seconds", "step", *scores, "num_frames", *losses])
+    lines = [["run", "seconds", "step", *scores, "num_frames", *losses]]
     for name, row in rows:
         values = [row.scores.get(score, "") for score in scores]
-        writer.writerow(
-            [name, row.seconds, row.step, *values, row.num_frames, *(row.losses.get(loss, "") for loss in losses)]
-        )
-    return content.getvalue()
+        terms = [row.losses.get(loss, "") for loss in losses]
+        lines.append([name, row.seconds, row.step, *values, row.num_frames, *terms])
+    return csv_text(lines)

@@ -19,8 +19,7 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
 from enerf_ns.dataparsers.recording.files import fill_page, write_together
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
-from enerf_ns.evaluation.history import HistoryRow
-from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views
 from enerf_ns.method.held_out_views import held_out_views, scores_at_stated_poses
@@ -37,11 +36,6 @@ from enerf_ns.report.trade_offs import default_targets
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LARGEST_EMBEDDED_VIDEO = 8_000_000
-"""Bytes up to which a video is put into the page; a larger one is a file beside it."""
-
-CSV_FILE = "error-against-time.csv"
 
 
 @dataclass
@@ -177,7 +171,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
         one.scores = {**dict.fromkeys(("psnr", "ssim", "lpips")), **scored.scores}
         one.scores |= {"not_scored": scored.not_scored} if scored.not_scored else {}
-        one.protocol = scored.protocol or _earlier_protocol(one.files, scored)
+        one.protocol = scored.protocol
     else:
         one.step = one.files.steps
     if run is None:
@@ -231,13 +225,6 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         one.seconds = float(np.interp(one.step, [row.step for row in history], [row.seconds for row in history]))
     elif run is not None:
         one.seconds = run.train_seconds
-
-
-def _earlier_protocol(files: RunFiles, row: HistoryRow) -> str:
-    """The protocol of a row of an earlier version, which named none."""
-    if not row.num_frames:
-        return EVENTS_PROTOCOL
-    return "log-affine-set" if "events" in files.config.pipeline.datamanager.supervision else "raw"
 
 
 def _loaded(one: _Reported) -> Run | None:
@@ -302,7 +289,7 @@ def _files(
     return {
         "report.html": _page(reported, tables, figures).encode(),
         "report.md": _markdown(reported, tables, {name: title for name, (title, _) in figures.items()}).encode(),
-        CSV_FILE: history_csv(histories).encode(),
+        "error-against-time.csv": history_csv(histories).encode(),
         "scores.json": (json.dumps(entries, indent=2) + "\n").encode(),
         **{name: content for name, (_, content) in figures.items()},
         **{one.picture[0]: one.picture[1] for one in reported if one.picture},
@@ -409,20 +396,16 @@ def _not_scored(one: _Reported) -> list[str]:
 
 
 def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, tuple[str, bytes]]) -> str:
-    """One HTML file with all pictures in it, which loads nothing but videos that are too large for it."""
+    """One HTML file that holds all tables, pictures and videos, and loads no other file."""
     runs = []
     for one in reported:
-        video = None
-        if one.video is not None:
-            small = len(one.video) <= LARGEST_EMBEDDED_VIDEO
-            video = _data_uri("video/mp4", one.video) if small else f"{one.prefix}video.mp4"
         runs.append(
             {
                 "title": one.name,
                 "picture": one.picture and _data_uri("image/png", one.picture[1]),
                 "captions": one.captions,
                 "notes": [*one.notes, *_not_scored(one)],
-                "video": video,
+                "video": one.video and _data_uri("video/mp4", one.video),
                 "video_note": one.video_note,
             }
         )

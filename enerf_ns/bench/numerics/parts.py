@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ from jaxtyping import Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from enerf_ns.bench.numerics.case import shown
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.evaluation.metrics import psnr
@@ -89,12 +88,6 @@ def error_of_parts(run: Run) -> list[PartError]:
         rows += _brightness_fit(run)
     pipeline.train()
     return rows
-
-
-def as_markdown(rows: Sequence[PartError]) -> str:
-    """A table with a line for each row."""
-    lines = [f"| {row.name} | {row.compared} | {shown(row.error, row.unit)} |" for row in rows]
-    return "\n".join(["| part | compared with | error |", "|---|---|---|", *lines]) + "\n"
 
 
 def pose_interpolation(

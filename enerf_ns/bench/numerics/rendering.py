@@ -12,7 +12,7 @@ from torch import Tensor
 
 from enerf_ns.bench.numerics.case import case
 from enerf_ns.bench.numerics.small_run import quiet, small_trainer
-from enerf_ns.rendering.field import brightness_of, limited_exp
+from enerf_ns.rendering.field import Brightness, brightness_of, limited_exp
 from enerf_ns.sensor.response import Linlog, Logarithm, Response
 from enerf_ns.supervision.event_supervision import brightness_change
 
@@ -130,15 +130,25 @@ def float16() -> float:
     return _half_error(torch.float16)
 
 
-def _fit_error(spread: float, response: Response) -> float:
-    """Root mean square error of log brightness of a field with the activation for high dynamic range, fitted to values
-    over a spread."""
+def fit_error(
+    spread: float, response: Response, activation: Brightness = "exponential", steps: int = 1500, rate: float = 0.05
+) -> float:
+    """Root mean square error of log brightness after Adam has fitted 1000 free numbers to evenly spread values.
+
+    Args:
+        spread: Range of log brightness; its offset is free.
+        response: From brightness to log brightness.
+        activation: From the free numbers, which stand for the network's output, to brightness.
+        steps: Of Adam.
+        rate: Learning rate of Adam.
+    """
     wanted = torch.linspace(0.0, spread, 1000)
     output = torch.zeros(1000, requires_grad=True)
-    optimizer = torch.optim.Adam([output], lr=0.05)
-    for _ in range(1500):
+    optimizer = torch.optim.Adam([output], lr=rate)
+    error = wanted
+    for _ in range(steps):
         optimizer.zero_grad()
-        found = response(brightness_of(output, "exponential"))
+        found = response(brightness_of(output, activation))
         error = (found - found.mean()) - (wanted - wanted.mean())
         error.square().mean().backward()
         optimizer.step()
@@ -147,9 +157,9 @@ def _fit_error(spread: float, response: Response) -> float:
 
 @case("log brightness over 10, linlog", "root mean square error of a fit", 0.1)
 def dynamic_range_linlog() -> float:
-    return _fit_error(10.0, Linlog())
+    return fit_error(10.0, Linlog())
 
 
 @case("log brightness over 10, logarithm", "root mean square error of a fit", 0.1)
 def dynamic_range_logarithm() -> float:
-    return _fit_error(10.0, Logarithm(0.001))
+    return fit_error(10.0, Logarithm(0.001))
