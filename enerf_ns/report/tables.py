@@ -56,12 +56,12 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def score_cell(name: str, value: object) -> str:
-    """A score as text."""
+    """A score as text, or `NONE`."""
     return format(value, ".2f" if name == "psnr" else ".3f") if isinstance(value, (int, float)) else NONE
 
 
 def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Sequence[float]) -> Table:
-    """Training time to reach each PSNR, for runs by name."""
+    """Training time after which each run reaches each PSNR (dB)."""
     rows = []
     for name, history in runs:
         cells = []
@@ -72,20 +72,24 @@ def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Seque
         rows.append([name, *cells])
     header = ["run", *(f"{target:g} dB" for target in targets)]
     note = (
-        "Training time until PSNR is first as high, linear between the two rows of the history around it; "
-        "at most: the first row is as good already."
+        "Training time until the run first has this PSNR, interpolated linearly between two rows of its history. At "
+        "most: the first row already has it."
     )
     return Table("Time to reach a PSNR", header, rows, note)
 
 
 def step_parts(history: Sequence[HistoryRow]) -> dict[str, float]:
-    """Seconds of a step by what they are spent on: of each part the median over the rows that measured it."""
+    """Seconds of each part of a training step: the median over the rows of a history that measured it."""
     parts = dict.fromkeys(part for row in history for part in row.parts)
     return {part: median(row.parts[part] for row in history if part in row.parts) for part in parts}
 
 
 def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
-    """Milliseconds and share of each part of a step, for runs by name."""
+    """Milliseconds and share of each part of a training step, by run.
+
+    Args:
+        runs: Name, and seconds by part.
+    """
     parts = list(dict.fromkeys(part for _, seconds in runs for part in seconds))
     rows = []
     for name, seconds in runs:
@@ -95,11 +99,11 @@ def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
             for part in parts
         ]
         rows.append([name, *cells, f"{1e3 * total:,.3g} ms"])
-    return Table("A training step", ["run", *parts, "in all"], rows, "Of each part the median over the history's rows.")
+    return Table("A training step", ["run", *parts, "total"], rows, "Each value is a median over the rows of the history.")
 
 
 def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
-    """Every row of every history, with its `SCORES`; cells are empty where a row has no such score or loss."""
+    """All rows of all histories as CSV. The cell of a score or loss that a row lacks is empty."""
     rows = [(name, row) for name, history in runs for row in history]
     optional = ("lpips_vgg", *AT_END)
     scores = [name for name in SCORES if name not in optional or any(name in row.scores for _, row in rows)]

@@ -1,4 +1,4 @@
-"""`enerf bench`: the tables and figures of the paper, and more, each from one command."""
+"""`enerf bench`: each table of the paper, and further experiments, with one command."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ CONSOLE = Console(width=140)
 
 @dataclass
 class Bench:
-    """Train and score all rows of an experiment, and print their table; without one, list the experiments."""
+    """Train and score all rows of an experiment, and print their table. Without an experiment, list all experiments."""
 
     experiment: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
-    """Which table: its name, as in the list."""
+    """Name of the experiment. Default: all experiments are listed."""
     settings: Annotated[BenchSettings, tyro.conf.arg(name="")] = field(default_factory=BenchSettings)
 
     def main(self) -> None:
@@ -41,17 +41,17 @@ class Bench:
                 print(f"{name} …", flush=True)
                 continue
             results.append(result)
-            told = result.get("failure") or f"{result['seconds']:.0f} s, {result['steps']} steps"
-            print(printable(f"{name}: {told}"), flush=True)
-        told = bench.results(results)
-        CONSOLE.print(scores_table(told).rich())
-        for remark in remarks(told):
+            outcome = result.get("failure") or f"{result['seconds']:.0f} s, {result['steps']} steps"
+            print(printable(f"{name}: {outcome}"), flush=True)
+        table = bench.results(results)
+        CONSOLE.print(scores_table(table).rich())
+        for remark in remarks(table):
             print(printable(f"* {remark}"))
         where = bench.output_dir / self.experiment
-        drawn = "; error against time in .png" if where.with_suffix(".png").exists() else ""
+        drawn = ", error against time in .png" if where.with_suffix(".png").exists() else ""
         print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
         if bench.before is not None:
-            changes = changes_since(told, bench.before)
+            changes = changes_since(table, bench.before)
             CONSOLE.print(changes_table(changes, str(self.settings.against)).rich())
             lost = [f"{change.sequence}, {change.row}" for change in changes if change.loses]
             if lost or not changes:

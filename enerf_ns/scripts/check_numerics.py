@@ -1,4 +1,4 @@
-"""`enerf check-numerics`: extreme cases, each against a closed form, float64 or another library."""
+"""`enerf check-numerics`: extreme cases, each compared with a closed form, float64 or another library."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from enerf_ns.dataparsers.recording.files import write_together
 
 @dataclass
 class CheckNumerics:
-    """Check that numbers hold at the extremes: one line a case, what is expected, the error, pass or fail."""
+    """Compute extreme cases, and print for each the expected result, the error, its bound, and pass or FAIL."""
 
     output_dir: Path | None = None
-    """Folder for numerics.md and numerics.json. None: they are not written."""
+    """Folder for numerics.md and numerics.json. Default: the files are not written."""
 
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE
