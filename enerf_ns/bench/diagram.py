@@ -1,4 +1,4 @@
-"""Rows of an experiment as error against the time they took, with the Pareto front of their means."""
+"""Plot of the PSNR of the rows of an experiment against their training time, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 def diagram(results: Results) -> bytes | None:
-    """A PNG with a plot for each sequence: PSNR against seconds of training, a mark a row at the means over its seeds,
-    with their standard deviations; None where no sequence has two rows to compare."""
+    """A PNG with a plot for each sequence: PSNR against training time in seconds, as means and standard deviations
+    over seeds. None if no sequence has two rows with scores."""
     from matplotlib.figure import Figure
 
     by_sequence: dict[str, list[Line]] = {}

@@ -1,4 +1,4 @@
-"""Tables of an experiment's results, as functions of its result file alone: for the terminal, Markdown and CSV."""
+"""Tables of the results of an experiment, made from its result file alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from enerf_ns.bench.published import MEAN
 from enerf_ns.report.tables import NONE, Table, csv_text
 
 Results = dict[str, Any]
-"""What a result file holds (`Bench.results`)."""
+"""Contents of a result file (`Bench.results`)."""
 
 DIGITS = {
     "psnr": 2,
@@ -23,7 +23,7 @@ DIGITS = {
     "refractory_ms": 2,
     **dict.fromkeys(("sample", "poses", "rays", "images", "forward_and_backward"), 2),
 }
-"""Digits behind the point, where they are not 3."""
+"""Number of decimals of scores, if not 3."""
 
 TITLES = {
     "psnr": "PSNR, dB",
@@ -43,7 +43,7 @@ TITLES = {
     "threshold_map_on": "map of C_on",
     "threshold_map_off": "map of C_off",
 }
-"""Names of scores for a reader, where they are not their own."""
+"""Titles of scores, if not their names."""
 
 LARGEST_LOSS = 0.3
 """PSNR (dB, mean over the seeds) that a row may lose against another version."""
@@ -59,15 +59,17 @@ class Line:
     row: str
     protocol: str
     scores: dict[str, list[float]] = field(default_factory=dict)
-    """By name, one a seed."""
+    """Scores by name, one for each seed."""
     published: dict[str, float] = field(default_factory=dict)
+    """Published scores by name."""
     seconds: list[float] = field(default_factory=list)
-    """Of training, one a run."""
+    """Training time of each run, s."""
     steps: list[int] = field(default_factory=list)
+    """Number of training steps of each run."""
 
 
 def lines(results: Results) -> list[Line]:
-    """The lines of the table: by sequence, rows in their order, then what others published alone."""
+    """The lines of the table by sequence: first the rows of the experiment, then rows that are only published."""
     runs, published = results["runs"], results["published"]
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     rows = list(dict.fromkeys(run["row"] for run in runs))
@@ -90,7 +92,7 @@ def lines(results: Results) -> list[Line]:
 
 
 def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
-    """Adds the scores of each seed that has all sequences, their mean over these."""
+    """Adds the mean scores over the sequences, for each seed that has all sequences."""
     for seed in dict.fromkeys(run["seed"] for run in runs):
         done = [run for run in runs if run["seed"] == seed and "failure" not in run]
         if len(done) < num_sequences:
@@ -106,7 +108,7 @@ def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
 
 @dataclass(frozen=True)
 class Change:
-    """What became of a row since another version: means over the seeds of the PSNR, dB."""
+    """PSNR of a row in another version and now, means over seeds in dB."""
 
     sequence: str
     row: str
@@ -115,12 +117,12 @@ class Change:
 
     @property
     def loses(self) -> bool:
-        """Whether the row lost more than it may."""
+        """Whether the row lost more than `LARGEST_LOSS`."""
         return self.now < self.before - LARGEST_LOSS
 
 
 def changes_since(results: Results, before: Results) -> list[Change]:
-    """What became of each row that both tables have, worst first."""
+    """The change of each row that both results have, largest loss first."""
     then = {(line.sequence, line.row): line.scores["psnr"] for line in lines(before) if line.scores.get("psnr")}
     now = {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
     found = [Change(*key, mean(then[key]), mean(now[key])) for key in now if key in then]
@@ -170,20 +172,19 @@ def _score(name: str, values: list[float]) -> str:
 
 
 def _truth(name: str, line: Line) -> str:
-    """What a score should be, where that is known."""
+    """The true value of a score in brackets, if known."""
     values = line.scores.get(f"true_{name}")
     return f" ({_score(name, [mean(values)])})" if values else ""
 
 
 def _published(name: str, value: float) -> str:
-    """As it was printed: with two digits at least, where ours have some."""
+    """A published score as printed there, with at least two decimals if ours has decimals."""
     digits = len(f"{value:g}".partition(".")[2])
     return f"{value:.{max(digits, 2) if DIGITS.get(name, 3) else 0}f}"
 
 
 def disagreements(results: Results) -> list[str] | None:
-    """Where one row is better than another here and worse as published, a sentence each; None where nothing can be
-    compared."""
+    """A sentence for each pair of rows whose order differs from the published one; None if nothing can be compared."""
     name = results["columns"][0]
     lower = name in LOWER_IS_BETTER
     compared, found = 0, []
@@ -209,7 +210,7 @@ def disagreements(results: Results) -> list[str] | None:
 
 
 def remarks(results: Results) -> Iterator[str]:
-    """What belongs to the table, a sentence each: how it was made, what is missing, where the order is another."""
+    """Sentences about the table: how it was made, what is missing, and which order differs from the published one."""
     runs, name = results["runs"], _title(results["columns"][0]).partition(",")[0]
     seeds = 1 + max((run["seed"] for run in runs), default=0)
     size = "" if results["scale"] is None else f" at scale {results['scale']:g} of 640 x 480"
@@ -240,7 +241,7 @@ def remarks(results: Results) -> Iterator[str]:
 
 
 def markdown(results: Results) -> str:
-    """The command, the table and what belongs to it."""
+    """The command, the tables and the remarks as Markdown."""
     tables = [scores_table(results)]
     if any("parts" in run for run in results["runs"]):
         tables.append(_parts_table(results))
@@ -262,7 +263,7 @@ def _parts_table(results: Results) -> Table:
 
 
 def csv_table(results: Results) -> str:
-    """A line for each run and protocol, with all its scores."""
+    """All scores as CSV, with one line for each run and protocol."""
     runs = [run for run in results["runs"] if "failure" not in run]
     names = dict.fromkeys(name for run in runs for scores in run["scores"].values() for name in scores)
     table = [["sequence", "row", "seed", "protocol", "steps", "seconds", *names]]

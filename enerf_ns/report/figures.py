@@ -23,7 +23,7 @@ SCORES = {
     "correlation": "correlation",
     "depth_rmse": "depth RMSE, m",
     "depth_rmse_known": "depth RMSE where known, m",
-    "depth_known": "depth known, share",
+    "depth_known": "known depth, share",
     "depth_rmse_spread": "depth RMSE, spread, m",
     "event_correlation": "event correlation",
     "event_rmse": "event RMSE, thresholds",

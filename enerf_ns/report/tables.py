@@ -99,7 +99,9 @@ def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
             for part in parts
         ]
         rows.append([name, *cells, f"{1e3 * total:,.3g} ms"])
-    return Table("A training step", ["run", *parts, "total"], rows, "Each value is a median over the rows of the history.")
+    return Table(
+        "A training step", ["run", *parts, "total"], rows, "Each value is a median over the rows of the history."
+    )
 
 
 def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:

@@ -201,8 +201,8 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         views, _ = aligned_views(views, scoring.protocol)
         one.captions.append(
             f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)} (numbers start at 0) after {stored:,} "
-            "training steps. In the column of errors, orange means that the render is too bright, and purple that it is "
-            f"too dark. Brightness is displayed as {screen.gamma}."
+            "training steps. In the column of errors, orange means that the render is too bright, and purple that it "
+            f"is too dark. Brightness is displayed as {screen.gamma}."
         )
         picture = _png(side_by_side(views, dataset.recording, screen.exponent))
         path = camera_path(dataset.cameras)
@@ -312,7 +312,9 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
             "training time": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
             **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
             "brightness scale": _brightness_scale(one),
-            "scored frames": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames}" if one.num_frames else NONE,
+            "scored frames": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames}"
+            if one.num_frames
+            else NONE,
             "on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
             "protocol": one.protocol if one.scores else NONE,
         }
@@ -323,13 +325,12 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
     protocols = dict.fromkeys(one.protocol for one in reported if one.scores)
     note = " ".join(
         [
-            "Scores are means over held-out frames. Training time is that of the training steps alone, up to the scored "
-            "step.",
+            "Scores are means over held-out frames. Training time is that of the training steps alone, up to the "
+            "scored step.",
             "A held-out frame is on the path if its pose lies among the training poses." * ("on the path" in header),
-            "The brightness scale is the factor by which the fit multiplies the contrast of renders. The expected value "
-            "is in brackets, if the recording states it: the sensor's mean contrast threshold divided by that of the "
-            "training."
-            * ("brightness scale" in header),
+            "The brightness scale is the factor by which the fit multiplies the contrast of renders. The expected "
+            "value is in brackets, if the recording states it: the sensor's mean contrast threshold divided by the one "
+            "that training used." * ("brightness scale" in header),
             *map(described, protocols),
         ]
     )
@@ -380,14 +381,14 @@ def _poses_table(one: _Reported, of_several: bool) -> Table:
         for row in one.poses
     ]
     note = (
-        "Values have standard errors. A part that the events do not determine, or whose error is not significant, keeps "
-        "the value of the recording."
+        "Values have standard errors. A part that the events do not determine, or whose error is not significant, "
+        "keeps the value of the recording."
     )
     if one.at_stated_poses:
         scores = ", ".join(f"{SCORES[name]} {score_cell(name, value)}" for name, value in one.at_stated_poses.items())
         note += (
-            " All scores above are at the corrected poses, which were not fitted to held-out frames. Scores at the poses "
-            f"of the recording: {scores}."
+            " All scores above are at the corrected poses, which were not fitted to held-out frames. Scores at the "
+            f"poses of the recording: {scores}."
         )
     header = ["part", "correction", "error", "image motion", "flag"]
     return Table(_of_run("Clock, poses and lens", one, of_several), header, rows, note)

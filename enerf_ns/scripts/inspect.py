@@ -47,7 +47,11 @@ class Inspect:
 
             recording = refined_recording(self.run, data)
             if recording.as_read is None:
-                print(printable(f"{self.run} corrected neither clock nor poses nor lens; they are those of the recording."))
+                print(
+                    printable(
+                        f"{self.run} corrected neither clock nor poses nor lens; they are those of the recording."
+                    )
+                )
             corrections = corrections_over_time(recording)
         inspection = Inspection.of(recording)
         inspection.print_tables(CONSOLE)

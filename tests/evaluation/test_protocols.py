@@ -150,7 +150,9 @@ def test_what_is_flat_is_refused(name: str, colour_filter: bool):
     sound, flat = pictures(2), [torch.full((12, 16, 3), 0.1, dtype=torch.float64)] * 2
     for rendered, recorded in ((flat, sound), (sound, flat), (flat, flat)):
         aligned = align(rendered, recorded, name, colour_filter)
-        assert all(str(fault).startswith("no brightness fits, since what is rendered or") for fault in aligned.faults)
+        assert all(
+            str(fault).startswith("no correction of brightness can be fitted, since") for fault in aligned.faults
+        )
         assert aligned.parameters == {}
         for image, same in zip(aligned.rendered, rendered, strict=True):
             torch.testing.assert_close(image, PROTOCOLS[name].encode(same))
