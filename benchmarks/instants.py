@@ -1,4 +1,4 @@
-"""What events say of the brightness that rays see: at events, and at any instant, of scenes that are known.
+"""Agreement of events with the true brightness of known scenes, at events and at any instant.
 
 Simulates recordings of an ideal sensor, draws pairs of instants as training does, renders the true scene at both, over
 the area of each pixel and through its centre alone, and compares the changes with what the events say. Prints for each

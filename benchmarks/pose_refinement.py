@@ -1,4 +1,4 @@
-"""What refining clock, mount, lens and trajectory is worth where they are wrong, and what it costs where they are not.
+"""Effect of refining clock, mount, lens and trajectory, for wrong and for correct poses.
 
 Simulates recordings of the validation set and the demo's, thins their poses out to 200 a second, makes each wrong in
 one way or in all, and trains with the right poses, with the wrong ones as they are, and with the wrong ones refined;

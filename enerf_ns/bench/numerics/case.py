@@ -1,4 +1,4 @@
-"""Extreme cases, each with what is expected, and how far from it the package may be."""
+"""Extreme cases with their expected results and bounds of their errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enerf_ns.report.tables import Table
 
 Measure = Callable[[], float]
-"""Computes the error of a case: its distance from a closed form or float64, or how many things went wrong."""
+"""Computes the error of a case: a distance from a closed form or float64, or the number of faults."""
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,11 @@ class Case:
 
     name: str
     expected: str
-    """What is expected, in words."""
+    """Expected result, in words."""
     bound: float
     """Largest error that passes."""
     unit: str
-    """Of the error and its bound."""
+    """Unit of the error and its bound."""
     measure: Measure
 
 
@@ -45,17 +45,17 @@ class Result:
 
 
 CASES: list[Case] = []
-"""All cases of the modules that are imported; `enerf_ns.bench.numerics.all_cases` imports all."""
+"""Cases of all imported modules. `enerf_ns.bench.numerics.all_cases` imports all modules."""
 
 
 def case(name: str, expected: str, bound: float = 0.0, unit: str = "") -> Callable[[Measure], Measure]:
-    """Makes a case of the function that computes its error.
+    """Returns a decorator that registers a function as the measure of a case.
 
     Args:
-        name: What is extreme.
-        expected: What is expected, in words.
+        name: Name of the case.
+        expected: Expected result, in words.
         bound: Largest error that passes.
-        unit: Of the error.
+        unit: Unit of the error.
     """
 
     def register(measure: Measure) -> Measure:
@@ -66,12 +66,12 @@ def case(name: str, expected: str, bound: float = 0.0, unit: str = "") -> Callab
 
 
 def run(case: Case) -> Result:
-    """Computes a case. One that raises, or whose error is not a number, has not passed."""
+    """Computes a case. A case that raises an error, or whose error is NaN, does not pass."""
     start = time.perf_counter()
     error, failure = None, ""
     try:
         error = float(case.measure())
-    except Exception as raised:  # whatever it is, it is the result
+    except Exception as raised:  # any error is a result
         failure = f"{type(raised).__name__}: {raised}"
     return Result(case, error, failure, time.perf_counter() - start)
 
