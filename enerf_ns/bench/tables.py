@@ -39,7 +39,7 @@ TITLES = {
     "brightness_scale": "scale",
     "event_correlation": "correlation of held-out events",
     "threshold_ratio": "C_on / C_off",
-    "refractory_ms": "blind, ms",
+    "refractory_ms": "refractory period, ms",
     "threshold_map_on": "map of C_on",
     "threshold_map_off": "map of C_off",
 }
