@@ -348,9 +348,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "ssim", "lpips_vgg"),
         published=published.UZH,
         source="Event-3DGS",
-        notes=(
-            "Event-3DGS does not name the views that it scores. Here every fourth frame is held out.",
-        ),
+        notes=("Event-3DGS does not name the views that it scores. Here every fourth frame is held out.",),
     ),
     "eds": Experiment(
         "Sequences of EDS (folders in --data), compared with GPERT and EventSplat.",
@@ -381,8 +379,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "ssim", "event_correlation", "depth_rmse", "brightness_scale"),
         measures=("events",),
         notes=(
-            f"Defaults may be chosen on {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are "
-            "only scored.",
+            f"Defaults may be chosen on {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are only scored.",
             "without-instants uses pairs of events and silent pairs, but no pairs of arbitrary instants.",
             "nerf-sharp trains on sharp frames alone, which shows the limit of the field, sampler and renderer.",
         ),

@@ -30,8 +30,8 @@ def view_scores(
     Returns:
         psnr (dB), ssim, correlation, the requested ones of lpips (AlexNet) and lpips_vgg, and, if the recording has
         depth, depth_rmse (metres). If the view has a confidence of its depth, also depth_known, the share of pixels
-        with known depth; depth_rmse_known over these pixels (metres); and depth_rmse_spread of the spread depth over all
-        pixels (metres). The correlation is that of the render before the correction of brightness.
+        with known depth; depth_rmse_known over these pixels (metres); and depth_rmse_spread of the spread depth over
+        all pixels (metres). The correlation is that of the render before the correction of brightness.
     """
     names = ["psnr", "ssim", *(NETWORKS[net].score for net in lpips_nets)]
     if view.recorded is None or aligned.recorded is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,8 +118,12 @@ def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], 
             rays = cameras[number : number + 1].to(pipeline.device).generate_rays(camera_indices=0, keep_shape=True)
             yield _below([_scaled(side, width) for side in _sides(pipeline, screen, rays)], strip)
 
-    with _partial(output) as partial:
+    partial = partial_of(output)
+    try:
         _write_mp4(partial, pictures(), int(path["fps"]))
+        partial.replace(output)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None:
@@ -212,17 +215,6 @@ def _strip(width: int, explained: dict[str, Any]) -> UInt8[np.ndarray, "height w
     fitting = np.full((height, total, 3), 255, np.uint8)
     fitting[: len(drawn), : drawn.shape[1]] = drawn[:height, :total]
     return fitting
-
-
-@contextmanager
-def _partial(output: Path) -> Iterator[Path]:
-    """A temporary file that replaces the output if the block succeeds, and is removed otherwise."""
-    partial = partial_of(output)
-    try:
-        yield partial
-        partial.replace(output)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _write_mp4(file: Path, pictures: Iterator[np.ndarray], fps: int) -> None:

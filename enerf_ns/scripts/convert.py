@@ -16,7 +16,7 @@ from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 @dataclass
 class Convert:
-    """Write a recording, or an event file (Prophesee RAW and DAT, AEDAT4), as a folder in the format event_recording."""
+    """Write a recording, or an event file (Prophesee RAW and DAT, AEDAT4), in the format event_recording."""
 
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of a recording in any known format, or event file: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4."""

@@ -40,8 +40,8 @@ class Export:
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run, or its config.yml."""
     output: Optional[Path] = None  # noqa: UP045
-    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .txt for poses. Default: mesh.ply, pointcloud.ply or
-    poses.txt in the folder of the run."""
+    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .txt for poses. Default: mesh.ply, pointcloud.ply
+    or poses.txt in the folder of the run."""
     voxel: Optional[float] = None  # noqa: UP045
     """Side in metres of the voxels in which depth is averaged. Default: 1.5 pixels at the median known depth."""
     reference: Optional[Path] = None  # noqa: UP045
@@ -98,10 +98,7 @@ class Export:
             table = {"reference": str(self.reference or path), "voxel": voxel, **asdict(scores)}
             written[f"{output.stem}.json"] = (json.dumps(table, indent=2) + "\n").encode()
             lines.append(str(scores))
-        try:
-            write_together(output.parent, written)
-        except OSError as error:
-            raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
+        _write(output, written)
         for line in [*(f"note: {note}" for note in notes), *lines]:
             print(printable(line))
 
@@ -112,17 +109,21 @@ class Export:
         recording, refiner = pipeline.datamanager.recording, pipeline.poses
         found = [] if refiner is None else findings(refiner, pipeline.datamanager.distance)
         camera = {**camera_json(recording.camera), "corrections": [row.as_dict() for row in found]}
-        try:
-            write_together(
-                output.parent,
-                {
-                    output.name: encode_tum(recording.trajectory),
-                    f"{output.stem}.json": (json.dumps(camera, indent=2) + "\n").encode(),
-                },
-            )
-        except OSError as error:
-            raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
+        about = (json.dumps(camera, indent=2) + "\n").encode()
+        _write(output, {output.name: encode_tum(recording.trajectory), f"{output.stem}.json": about})
         corrected = [f"{row.what}: {row.value}" for row in found if row.is_corrected]
         for line in corrected or ["No error of the poses was found. They are those of the recording."]:
             print(printable(line))
         print(printable(f"{len(recording.trajectory.times):,} poses: {output}"))
+
+
+def _write(output: Path, files: dict[str, bytes]) -> None:
+    """Writes the output and the files beside it.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    try:
+        write_together(output.parent, files)
+    except OSError as error:
+        raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
