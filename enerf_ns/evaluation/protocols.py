@@ -49,7 +49,7 @@ class Protocol:
     """Comparison of renders with frames. Both hold linear brightness, frames in [0, 1]."""
 
     description: str
-    """One sentence for readers of the scores."""
+    """Sentences for readers of the scores."""
     fit: Fit | None = None
     """Fit of the correction of brightness. None: renders are not corrected."""
     each_picture: bool = False
@@ -279,7 +279,7 @@ EVENTS_PROTOCOL = "events"
 
 
 def described(protocol: str) -> str:
-    """A sentence about a protocol.
+    """Sentences that describe a protocol.
 
     Args:
         protocol: Name of one of `PROTOCOLS`, or `EVENTS_PROTOCOL`.
