@@ -1,8 +1,8 @@
-"""From an HDF5 file to a ready index of events by pixel: speed on one core, memory, and the second start.
+"""Speed on one core, memory, and time of the second start, for the index of the events in an HDF5 file.
 
     python benchmarks/event_index.py --events 1_000_000 10_000_000 100_000_000
 
-Each size is measured in a process of its own. Peak memory is what the process grew by while the index was made.
+Each size is measured in a separate process. Peak memory is the growth of the process while the index is made.
 """
 
 from __future__ import annotations

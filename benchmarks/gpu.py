@@ -1,7 +1,7 @@
-"""What a GPU makes of training: a step by its parts, seconds to a quality, peak memory, pictures rendered a second.
+"""Training on a GPU: time of a step by part, time to a PSNR, peak memory, and rendered pictures per second.
 
 Prints Markdown tables, and stores their numbers under --json. Recordings are simulated; `benchmarks/gpu.sh` runs this
-with all that goes with it. --small shrinks everything, to try the script itself on a CPU.
+script with its companions. --small shrinks all sizes, to test the script on a CPU.
 
     python benchmarks/gpu.py --json gpu.json
     python benchmarks/gpu.py --small --device cpu

@@ -1,4 +1,4 @@
-"""What events say of the brightness that rays see: at events, and at any instant, of scenes that are known.
+"""Agreement of events with the true brightness of known scenes, at events and at any instant.
 
 Simulates recordings of an ideal sensor, draws pairs of instants as training does, renders the true scene at both, over
 the area of each pixel and through its centre alone, and compares the changes with what the events say. Prints for each
@@ -72,20 +72,9 @@ def settings_of(name: str, folder: Path) -> SimulationSettings:
     thresholds = (THRESHOLD, THRESHOLD)
     if sequence is None:
         return SimulationSettings(name, layout="esim", contrast_thresholds=thresholds)
-    for file, content in sequence.files.items():
-        (folder / file).write_text(content)
-    given = {
-        key: value
-        for key, value in sequence.simulation.items()
-        if key not in ("key_frames", "contrast_thresholds", "colour", "bayer_pattern")
-    }
-    return SimulationSettings(
-        str(folder / f"{Path(sequence.scene or '').stem}.json"),
-        key_frames=folder / sequence.simulation["key_frames"],
-        layout="esim",
-        contrast_thresholds=thresholds,
-        **given,
-    )
+    ideal = SimulationSettings(layout="esim", contrast_thresholds=thresholds)
+    changed = ("layout", "contrast_thresholds", "sensor", "colour", "bayer_pattern")
+    return sequence.simulation_settings(folder, **{name: getattr(ideal, name) for name in changed})
 
 
 def changes(scene: RenderedScene, settings: SimulationSettings, batch: EventBatch) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""What the rates of events tell of the lag of slow pixels, where the scene is known.
+"""Estimate of the lag of slow pixels from event rates, compared with the true lag of a known scene.
 
 Simulates the scene `shapes` with pixels of a finite bandwidth, draws pairs of events, renders what the pixels saw at
-both instants, and compares by how much brightness had changed more than the events say (the lag, exactly) with what the
-sensor model makes of the rates of events. Prints the spread of both, in contrast thresholds, and the factor by which
-the lag is told too small.
+both instants, and compares the true lag, which is the change of brightness minus that of the events, with the lag that
+the sensor model estimates from event rates. Prints the standard deviations of the true lag and of the error, in
+contrast thresholds, and the factor by which the estimate is too small.
 
     python benchmarks/lag.py
 """
@@ -29,7 +29,7 @@ THRESHOLD, RESPONSE, PAIRS = 0.25, "logarithm:0.001", 3000
 
 
 def main() -> None:
-    print("| cut-off, Hz | lag, thresholds | lag that is not told | factor |\n| --- | --- | --- | --- |")
+    print("| cut-off, Hz | lag, thresholds | error of the estimate | factor |\n| --- | --- | --- | --- |")
     for cutoff in (50.0, 100.0, 200.0, 400.0):
         settings = SimulationSettings("shapes", layout="esim", sensor=SensorSettings(cutoff_frequency=cutoff))
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""The default and the setting of the paper on one recording: what the paper's has reached after ten times as long.
+"""PSNR of the default and of the setting of the paper, which trains ten times as long, on one recording.
 
 Each seed trains `enerf` for some steps, and then `enerf-paper` for ten times as many seconds of the processor, or of
 the clock on a GPU, there with as many pairs a step as in the paper, and on a CPU with those of the default. Prints a

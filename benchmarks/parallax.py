@@ -1,4 +1,4 @@
-"""What events tell of near and far: cameras that only turn, bounded scenes, and what lies beyond the box.
+"""Depth range that events determine, for cameras that only rotate, bounded scenes, and scenes beyond the box.
 
     python benchmarks/parallax.py [RECORDING ...]
 

@@ -1,4 +1,4 @@
-"""What refining clock, mount, lens and trajectory is worth where they are wrong, and what it costs where they are not.
+"""Effect of refining clock, mount, lens and trajectory, for wrong and for correct poses.
 
 Simulates recordings of the validation set and the demo's, thins their poses out to 200 a second, makes each wrong in
 one way or in all, and trains with the right poses, with the wrong ones as they are, and with the wrong ones refined;
@@ -119,20 +119,17 @@ def right_poses(name: str, work: Path) -> Path:
     """The recording in the layout event_recording, simulated once."""
     from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
     from enerf_ns.simulator.engine import simulate
+    from enerf_ns.simulator.event_sensor import SensorSettings
     from enerf_ns.simulator.settings import SimulationSettings
 
     folder = work / name / "right"
     if folder.exists():
         return folder
-    (work / name).mkdir(parents=True, exist_ok=True)
     sequence = (CHOSEN_ON | ONLY_SCORED).get(name)
     if sequence is None:
         settings = SimulationSettings(name, layout="event_recording")
     else:
-        for file, content in sequence.files.items():
-            (work / name / file).write_text(content)
-        given = {**sequence.simulation, "key_frames": work / name / str(sequence.simulation["key_frames"])}
-        settings = SimulationSettings(str(work / name / str(sequence.scene)), layout="event_recording", **given)
+        settings = sequence.simulation_settings(work / name, layout="event_recording", sensor=SensorSettings())
     simulate(settings, folder)
     return folder
 

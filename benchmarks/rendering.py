@@ -1,4 +1,4 @@
-"""Rays rendered a second on this machine, and how near a picture is to the sum over all of its samples.
+"""Rays rendered per second on this machine, and difference of the picture from the sum over all samples.
 
 Takes turns between ways to render the first held-out camera of a run, and prints a Markdown table: rays a second (the
 best of the repetitions), and PSNR against every sample of every ray, which is what Nerfstudio's own parts compute.

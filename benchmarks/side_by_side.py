@@ -1,4 +1,4 @@
-"""Two trainings at a time on one machine: the share of its speed that each keeps.
+"""Speed of two simultaneous trainings on one machine, relative to that of one training.
 
 Trains on the simulated demo, alone and then twice at once, each time for some seconds after the first, and prints
 steps a second and their ratio.
@@ -27,7 +27,7 @@ SETTLING, TIMED = 10.0, 15.0
 
 
 def steps_a_second(recording: Path, folder: Path) -> float:
-    """Of a training on all cores."""
+    """Steps per second of a training on all cores."""
     config = method_config("enerf", recording, folder, {"evaluation_share": 0.0, "machine.device_type": "cpu"})
     trainer = set_up(config)
     trainer.pipeline.train()
@@ -42,7 +42,7 @@ def steps_a_second(recording: Path, folder: Path) -> float:
 
 
 def at_once(number: int, recording: Path, folder: Path) -> list[float]:
-    """Steps a second of so many trainings."""
+    """Steps per second of each of several simultaneous trainings."""
     command = [sys.executable, __file__, str(recording), str(folder)]
     running = [
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(number)

@@ -1,4 +1,4 @@
-"""What making events costs beside rendering the pictures that they are made of, each on one thread.
+"""Time to make events compared with the time to render their pictures, each on one thread.
 
     python benchmarks/simulator.py
 
@@ -34,7 +34,7 @@ SENSORS = {
         readout_rate=5e7,
     ),
 }
-"""All that a sensor can have is on in the second."""
+"""Sensors by name: an ideal one, and one with all effects."""
 
 PICTURES_PER_SECOND = 2500
 
@@ -75,7 +75,7 @@ def main(
 
 
 def timed(call, *arguments):
-    """Seconds, and what the call returns."""
+    """Duration of a call in seconds, and its result."""
     begin = time.perf_counter()
     result = call(*arguments)
     return time.perf_counter() - begin, result

@@ -1,4 +1,4 @@
-"""What it costs to render more often for the events of a simulation, and what that changes.
+"""Cost and accuracy of simulated events against the rate of rendering.
 
     python benchmarks/simulator_accuracy.py
 

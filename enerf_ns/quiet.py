@@ -1,4 +1,4 @@
-"""Warnings of the packages below, of which a user of ours can mend nothing."""
+"""Warnings of other packages, about which a user can do nothing."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ KNOWN_WARNINGS = (
     (UserWarning, r"Converting a tensor with requires_grad=True to a scalar", r"nerfstudio\.utils\.writer"),
     (UserWarning, r"Using a non-tuple sequence for multidimensional indexing", r"nerfstudio\.cameras\."),
 )
-"""Category, beginning of the message, and the modules that it comes from, as regular expressions."""
+"""Category, and regular expressions of the message's beginning and of the module."""
 
 
 def silence_known_warnings() -> None:
-    """Hides `KNOWN_WARNINGS` in this process from now on: where a command or a run of ours begins, never at import."""
+    """Hides `KNOWN_WARNINGS` in this process from now on. Commands and runs call it when they begin, never imports."""
     for category, message, module in KNOWN_WARNINGS:
         warnings.filterwarnings("ignore", message, category, module)

@@ -1,4 +1,4 @@
-"""What training says on the terminal, or in what stands for one."""
+"""Output of training on a terminal or in a log file."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from rich.text import Text
 from enerf_ns.dataparsers.recording.errors import printable
 
 REWRITTEN_EVERY, PRINTED_EVERY = 0.25, 30.0
-"""Seconds between two states of the line on a terminal, and where lines cannot be rewritten."""
+"""Seconds between two updates of the status line, on a terminal and elsewhere."""
 
 
 class StatusLine:
-    """One line that is rewritten in place; where the output is no terminal, it is printed now and then."""
+    """A line that is rewritten in place on a terminal, and printed every 30 s elsewhere."""
 
     def __init__(self) -> None:
         self._next = 0.0
 
     @property
     def is_due(self) -> bool:
-        """Whether the line is to be shown anew."""
+        """Whether it is time to update the line."""
         return time.monotonic() >= self._next
 
     def show(self, text: str) -> None:
-        """Shows the line; what is printed next takes its place on a terminal."""
+        """Shows the line. On a terminal, the next output replaces it."""
         clear_line()
         if CONSOLE.is_terminal:
             width = shutil.get_terminal_size().columns - 1
@@ -44,18 +44,18 @@ class StatusLine:
 
 
 def clear_line() -> None:
-    """Removes what the line shows, before anything else is printed."""
+    """Removes the status line from the terminal, before other output."""
     CONSOLE.control(Control((ControlType.ERASE_IN_LINE, 2)))
 
 
 def say(sentence: str) -> None:
-    """Prints what a person should know, in yellow."""
+    """Prints a sentence to the user, in yellow."""
     clear_line()
     CONSOLE.print(Text(printable(sentence), "yellow"), soft_wrap=True)
 
 
 def say_where(what: str, where: str) -> None:
-    """Prints a place, or a command, on one line, however long it is, so that it can be copied; with paths `quoted`."""
+    """Prints a path or a command on one line of any length, so that it can be copied. Its paths must be `quoted`."""
     CONSOLE.print(Text.assemble((f"{what}:", "bold"), f" {where}"), soft_wrap=True)
 
 
@@ -71,12 +71,12 @@ CHATTER = (
     "disabled local writer",
     "[NOTE] Not running eval iterations since",
 )
-"""How lines of Nerfstudio begin that tell a person nothing, or a path in which brackets are taken for colours."""
+"""Beginnings of lines of Nerfstudio that do not help the user, or that fail on paths with brackets."""
 
 
 @contextmanager
 def without_chatter() -> Iterator[None]:
-    """Leaves out, in the block, `CHATTER` and the box by which Nerfstudio ends a training, whose paths ours tells."""
+    """Suppresses `CHATTER` and the box at the end of Nerfstudio's training, because our output has its paths."""
 
     def without(say: Callable[..., None]) -> Callable[..., None]:
         def said(*objects: Any, **options: Any) -> None:
@@ -92,7 +92,7 @@ def without_chatter() -> Iterator[None]:
 
 
 def duration(seconds: float) -> str:
-    """A time as a person says it, in its two largest units."""
+    """A duration in words, in its two largest units."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -1,4 +1,4 @@
-"""Rows of an experiment as error against the time they took, with the Pareto front of their means."""
+"""Plot of the PSNR of the rows of an experiment against their training time, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
 from enerf_ns.bench.tables import Line, Results, lines
-from enerf_ns.report.figures import GREY, WIDTH, style
+from enerf_ns.report.figures import GREY, WIDTH, plain, style
 from enerf_ns.report.trade_offs import pareto_front
 
 if TYPE_CHECKING:
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 def diagram(results: Results) -> bytes | None:
-    """A PNG with a plot for each sequence: PSNR against seconds of training, a mark a row at the means over its seeds,
-    with their standard deviations; None where no sequence has two rows to compare."""
+    """A PNG with a plot for each sequence: PSNR against training time in seconds, as means and standard deviations
+    over seeds. None if no sequence has two rows with scores."""
     from matplotlib.figure import Figure
 
     by_sequence: dict[str, list[Line]] = {}
@@ -51,6 +51,5 @@ def _plot(axis: Axes, found: list[Line]) -> None:
     front = sorted(point for point, is_best in zip(means, best, strict=True) if is_best)
     axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1, label="Pareto front")
     axis.set(xlabel="training, s", ylabel="PSNR, dB")
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
+    plain(axis)
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8)

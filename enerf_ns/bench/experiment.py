@@ -1,72 +1,101 @@
-"""What an experiment of `enerf bench` is made of: rows, ways to learn, and sequences, what is learnt from."""
+"""The parts of an experiment of `enerf bench`: rows are ways to train, sequences are recordings to train on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS, Published
+from enerf_ns.dataparsers.recording.files import write_whole
+
+if TYPE_CHECKING:
+    from enerf_ns.simulator.settings import SimulationSettings
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way to learn: what it changes of the method, by the names of ns-train's flags."""
+    """One way to train."""
 
     changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings that differ from the method, by the names of ns-train's flags."""
     factors: Mapping[str, float] = field(default_factory=dict)
-    """By how much settings are multiplied whose value is chosen from the recording."""
+    """Factors of settings whose value is chosen from the recording, by name."""
     method: str | None = None
-    """Method of ns-train. None: that of the bench."""
+    """Method of ns-train. None: the method of --method."""
     reconstruction: Literal["e2vid", "filter"] | None = None
-    """What reconstructs, from events alone, the frames that are learnt from; None: they are the recording's own."""
+    """How the training frames are reconstructed from events. None: the recording's own frames are used."""
     known_sensor: bool = False
-    """Whether it is told what the sequence simulates of the sensor."""
+    """Whether the row gets the parameters of the simulated sensor."""
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """What is learnt from: a recording that is simulated, or one that the user has."""
+    """A recording to train on, simulated or given by the user."""
 
     scene: str | None = None
-    """What `enerf simulate` shows. None: the recording is the folder of this sequence's name in --data, or --data."""
+    """Scene for `enerf simulate`. None: the recording is --data, or the folder of this name in --data."""
     preset: str | None = None
-    """The paper's selections that are used."""
+    """Name of the preset with the paper's selections."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """As of `Row`."""
+    """Settings that differ from the method, by the names of ns-train's flags."""
     simulation: Mapping[str, Any] = field(default_factory=dict)
     """Further settings of the simulation."""
     sensor: Mapping[str, Any] | None = None
-    """Settings of the simulated sensor, of which the recording then states nothing. None: ideal, and stated."""
+    """Settings of the simulated sensor, which the recording then does not state. None: an ideal sensor, which the
+    recording states."""
     files: Mapping[str, str] = field(default_factory=dict)
-    """Text by the names of the files that scene and key_frames name."""
+    """Contents of the files that scene and key_frames name, by file name."""
+
+    def simulation_settings(self, folder: Path, **changes: Any) -> SimulationSettings:
+        """Settings of the simulation of this sequence, whose scene and key frames are written into a folder.
+
+        Args:
+            folder: Made if it does not exist.
+            changes: Settings that take the place of those of the sequence.
+
+        Raises:
+            OSError: The folder cannot be written to.
+        """
+        from enerf_ns.simulator.event_sensor import SensorSettings
+        from enerf_ns.simulator.settings import SimulationSettings
+
+        for name, content in self.files.items():
+            write_whole(folder / name, content)
+        given = {"scene": self.scene, "sensor": SensorSettings(**(self.sensor or {})), **self.simulation, **changes}
+        for name in ("scene", "key_frames"):
+            if given.get(name) in self.files:
+                given[name] = folder / given[name]
+        return SimulationSettings(**{**given, "scene": str(given["scene"])})
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table: each row on each sequence."""
+    """A table with each row on each sequence."""
 
     sentence: str
-    """What is compared."""
+    """Sentence about the comparison."""
     rows: tuple[str, ...]
     sequences: tuple[str, ...] = ()
-    """Sequences that are simulated."""
+    """Simulated sequences."""
     recorded: tuple[str, ...] = ()
-    """Sequences within --data, which take the place of the simulated ones where it is given."""
+    """Sequences in --data, which replace the simulated ones if --data is given."""
     beside: bool = False
-    """Whether those within --data stand beside the simulated ones instead of in their place."""
+    """Whether sequences in --data are added to the simulated ones instead of replacing them."""
     columns: tuple[str, ...] = PSNR_SSIM_LPIPS
-    """Scores that are shown, the one that rows are ordered by first."""
+    """Scores in the table. The first one orders the rows."""
     protocols: tuple[str, ...] = ("log-affine-set",)
-    """How scores are measured; what is published beside them is of the first."""
+    """Protocols of the scores. Published scores stand beside those of the first protocol."""
     measures: tuple[str, ...] = ()
-    """Names of further `measures.MEASURES` of each run."""
+    """Names of further `measures.MEASURES`."""
     parts: bool = False
-    """Whether the numerical errors of the parts of each run are told, too."""
+    """Whether to add the numerical errors of the parts of each run."""
     mean: bool = False
-    """Whether means over the sequences are shown instead of the sequences."""
+    """Whether the table shows means over the sequences instead of each sequence."""
     published: Published = field(default_factory=dict)
+    """Published scores."""
     source: str = "the paper"
-    """Who published it."""
+    """Publication of these scores."""
     notes: tuple[str, ...] = ()
-    """What a reader has to know to compare, one sentence each."""
+    """Sentences that a reader needs for the comparison."""

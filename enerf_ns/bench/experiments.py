@@ -1,4 +1,4 @@
-"""The experiments of `enerf bench`: what is learnt from what, on which recordings, and what is told of it."""
+"""The experiments of `enerf bench`: their rows, sequences, scores and notes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FRAMES = {DATA + "supervision": "frames"}
 SHARP = {PARSER + "train_frames": "sharp"}
 EVENTS_AND_FRAMES = {DATA + "supervision": "events+frames"}
 ONE_INSTANT = {DATA + "exposure_samples": 1}
-"""Takes blurred frames for sharp ones."""
+"""Treats blurred frames as sharp ones."""
 
 PAPER_LOSS = {
     MODEL + "event_loss": "squared",
@@ -30,12 +30,12 @@ PAPER_LOSS = {
     DATA + "pair_mode": "successor",
     DATA + "silent_pairs": 0,
 }
-"""The paper's event loss, without no-event loss, on pairs of successors."""
+"""The paper's event loss on pairs of successive events, without no-event loss."""
 
 SILENT_PAIRS = 341
 PAPER_C = 0.2
-"""Threshold of the simulated sequences. Losses here count changes of log brightness in thresholds, those of the paper
-do not: of its weights, that of the no-event loss is divided by C, and that of frames by C^2."""
+"""Contrast threshold C of the simulated sequences. Our losses are in units of C, and those of the paper are not. So the
+paper's weight of the no-event loss is divided by C, and that of the frame loss by C^2."""
 
 
 def _no_event_loss(weight: float) -> dict[str, Any]:
@@ -54,7 +54,7 @@ FORCED_ON: dict[str, Any] = {
     MODEL + "opacity_loss_weight": 1.0,
     MODEL + "brightness": "exponential",
 }
-"""What forces each part of the method on that a scene may do without."""
+"""Turns on all parts of the method that some scenes do not need."""
 
 LEFT_OUT: dict[str, dict[str, Any]] = {
     "silent-pixels": {DATA + "silent_pairs": 0},
@@ -66,7 +66,7 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
     "opacity-loss": {MODEL + "opacity_loss_weight": 0.0},
     "dynamic-range": {MODEL + "brightness": "log-sigmoid"},
 }
-"""What leaves each of them out; in place of the proposal network are 64 even samples."""
+"""Turns off each of these parts. 64 even samples replace the proposal network."""
 
 NOTHING_LEARNED: dict[str, Any] = {
     SENSOR + f"learn_{part}": False
@@ -81,12 +81,11 @@ FIXED_SENSOR: dict[str, Any] = {
     DATA + "max_pair_distance": 10,
     MODEL + "level_loss_weight": 0.0,
 }
-"""Takes a sensor of which nothing is known for an ideal one, and learns nothing of it, nor holds the level of
-brightness."""
+"""Assumes an ideal sensor, learns no sensor parameter, and has no loss of the level of brightness."""
 
 
 def known_sensor(sensor: SensorSettings) -> dict[str, Any]:
-    """What states a simulated sensor, as far as the method has settings for it."""
+    """Settings of the method that state the parameters of a simulated sensor."""
     return {
         SENSOR + "contrast_thresholds": tuple(sensor.contrast_thresholds),
         SENSOR + "response": sensor.response,
@@ -148,10 +147,10 @@ ROWS: dict[str, Row] = {
     "learned": Row(),
     "known": Row(known_sensor=True),
 }
-"""Rows by name; two experiments that have one of the same name share its runs."""
+"""Rows by name. Experiments with the same row share its runs."""
 
 NEAR = (0.9, 2.6)
-"""Metres between which the near things of the unbounded scene lie."""
+"""Range of depth of the near objects of the unbounded scene, metres."""
 
 UNBOUNDED_SCENE = {
     "parts": [
@@ -201,8 +200,8 @@ SENSORS: dict[str, Sequence] = {
         },
     ),
 }
-"""One recording for each fault of a sensor, then several together: medium and hard are the spreads and refractory
-periods of Robust e-NeRF (Low and Lee, ICCV 2023)."""
+"""Sequences with one fault of the sensor each, and with several. medium and hard have the spreads of thresholds and the
+refractory periods of Robust e-NeRF (Low and Lee, ICCV 2023)."""
 
 SEQUENCES: dict[str, Sequence] = {
     **{name: Sequence(name, preset=name) for name in FIVE},
@@ -231,7 +230,7 @@ SEQUENCES: dict[str, Sequence] = {
     "mocap-desk2": Sequence(preset="mocap-desk2"),
     "mocap-desk2-6views": Sequence(preset="mocap-desk2-6views"),
 }
-"""Sequences by name. Presets bring the paper's frames, times and thresholds, and to enerf-paper its box and batch."""
+"""Sequences by name. A preset sets the paper's frames, times and thresholds, and for enerf-paper also box and batch."""
 
 BASELINES = (
     "nerf-sharp",
@@ -244,41 +243,41 @@ BASELINES = (
     "events+blurred-one-instant",
 )
 OF_BASELINES = (
-    "nerf-sharp and nerf-blurred are the field, sampler and renderer of the method with the frame loss alone.",
-    "deblur renders each frame over the poses of its exposure; the paper's row is Deblur-NeRF, which knows none.",
-    "e2vid and filter reconstruct frames from the events and learn from these; filter is a complementary filter, which "
-    "the paper does not have.",
-    "events+blurred renders frames over their exposure; events+blurred-one-instant does not, as in the paper.",
+    "nerf-sharp and nerf-blurred train the field of the method with the frame loss alone.",
+    "deblur renders each frame over the poses of its exposure. The paper's row is Deblur-NeRF, which has no poses.",
+    "e2vid and filter train on frames that are reconstructed from the events. filter is a complementary filter, which "
+    "is not in the paper.",
+    "events+blurred renders frames over their exposure. events+blurred-one-instant does not, as in the paper.",
 )
 
 EXPERIMENTS: dict[str, Experiment] = {
     "spiral": Experiment(
-        "Frames, events, and both, on the spirals and with fewer views.",
+        "Frames, events, and both, on the spiral sequences and with fewer views.",
         BASELINES,
         tuple(published.SPIRAL),
         published=published.SPIRAL,
         notes=OF_BASELINES,
     ),
     "shake": Experiment(
-        "Frames, events, and both, by a shaking camera: mild, medium and strong blur.",
+        "Frames, events, and both, of a shaking camera with mild, medium and strong blur.",
         BASELINES,
         tuple(published.SHAKE),
         published=published.SHAKE,
         notes=OF_BASELINES,
     ),
     "ablation": Experiment(
-        "The paper's event loss, normalised, over windows, with no-event loss; mean over five sequences.",
+        "Variants of the paper's event loss, mean over five sequences.",
         ("events", "paper-loss", "normalised-loss", "windows-60ms", "no-event-loss"),
         FIVE,
         published=published.ABLATION,
         mean=True,
         notes=(
-            "events is the method as it is, the others have the paper's losses and pairs; the paper does not tell the "
-            "weight of its no-event loss, which is 1 here.",
+            "events is our default method. The other rows have the paper's losses and pairs. The paper does not state "
+            "the weight of its no-event loss, which is 1 here.",
         ),
     ),
     "losses": Experiment(
-        "Published losses on the same field; mean over five sequences.",
+        "Published losses on the same field, mean over five sequences.",
         ("events", *PUBLISHED_LOSSES),
         FIVE,
         mean=True,
@@ -293,7 +292,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         "Weight of the loss on blurred frames beside events, in the paper's unit.",
         tuple(name for name in ROWS if name.startswith("frame-weight-")),
         ("shake-carpet1",),
-        notes=("The paper shows pictures and no scores: large weights bring back blur, small ones lose colour.",),
+        notes=("The paper shows pictures without scores: large weights bring back blur, small weights lose colour.",),
     ),
     "encoding": Experiment(
         "Levels and finest resolution of the hash grid.",
@@ -301,19 +300,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         ("shake-carpet1",),
         published=published.ENCODING,
         notes=(
-            "Levels and finest resolution are those chosen for the recording, times what the paper's are of its 16 "
-            "levels and N_max of 6144.",
+            "Levels and finest resolution are those chosen for the recording, times the ratio of the paper's values to "
+            "its 16 levels and N_max of 6144.",
         ),
     ),
     "depth": Experiment(
-        "Depth at all train and test poses, of the runs of spiral and shake.",
+        "Depth error at all training and test poses, of the runs of spiral and shake.",
         BASELINES,
         FIVE,
         columns=("depth_rmse_all_poses",),
         published=published.DEPTH,
     ),
     "run-time": Experiment(
-        "What a training step spends its time on, in percent.",
+        "Time of a training step, and the share of each part in percent.",
         ("nerf-blurred", "events", "events+blurred", "events-30096-pairs"),
         ("spiral1",),
         columns=("ms_a_step", "sample", "poses", "rays", "images", "forward_and_backward"),
@@ -322,14 +321,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=("The paper's step has 30096 rays, on an A40.",),
     ),
     "views": Experiment(
-        "Many views against 6, of frames and of events.",
+        "Many views against 6 views, for frames and for events.",
         ("nerf-blurred", "events"),
         ("spiral1", "spiral1-6views"),
         recorded=("mocap-desk2", "mocap-desk2-6views"),
-        notes=("The paper compares 60 with 6 views of mocap-desk2 by pictures; --data FOLDER names that recording.",),
+        notes=("The paper compares pictures of 60 and 6 views of mocap-desk2. --data FOLDER gives this recording.",),
     ),
     "slider-depth": Experiment(
-        "UZH's slider_depth (--data) beside Event-3DGS, and what events add to its frames.",
+        "UZH's slider_depth (--data), compared with Event-3DGS.",
         ("nerf-blurred", "e2vid", "filter", "events", "events+blurred"),
         recorded=("slider_depth",),
         protocols=("raw", "log-affine-set"),
@@ -342,19 +341,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
     ),
     "uzh": Experiment(
-        "Other sequences of UZH's data set (--data holds their folders) beside Event-3DGS.",
+        "Other sequences of UZH's data set (folders in --data), compared with Event-3DGS.",
         ("events",),
         recorded=tuple(published.UZH),
         protocols=("raw", "log-affine-set"),
         columns=("psnr", "ssim", "lpips_vgg"),
         published=published.UZH,
         source="Event-3DGS",
-        notes=(
-            "As of slider-depth: Event-3DGS does not name the views that it scores; here every fourth is held out.",
-        ),
+        notes=("Event-3DGS does not name the views that it scores. Here every fourth frame is held out.",),
     ),
     "eds": Experiment(
-        "EDS (--data holds the folders of the sequences) beside GPERT and EventSplat.",
+        "Sequences of EDS (folders in --data), compared with GPERT and EventSplat.",
         ("events",),
         recorded=tuple(name for name in published.EDS if name != published.MEAN),
         columns=("psnr", "ssim", "lpips", "lpips_vgg"),
@@ -366,15 +363,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
     ),
     "tum-vie": Experiment(
-        "TUM-VIE (--data holds the folders of the sequences) beside GPERT.",
+        "Sequences of TUM-VIE (folders in --data), compared with GPERT.",
         ("events",),
         recorded=tuple(name for name in published.TUM_VIE if name != published.MEAN),
         published=published.TUM_VIE,
         source="GPERT",
-        notes=("Here frames and time range are those of E-NeRF's configs; GPERT's are those of Robust e-NeRF.",),
+        notes=("Frames and time range are those of E-NeRF's configs. GPERT uses those of Robust e-NeRF.",),
     ),
     "validation": Experiment(
-        "Recordings that differ in what matters, by which defaults are chosen and held to account.",
+        "Different recordings on which changes of defaults are chosen and checked.",
         ("events", "without-instants", "nerf-sharp"),
         (*CHOSEN_ON, *ONLY_SCORED),
         recorded=(REAL,),
@@ -382,20 +379,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "ssim", "event_correlation", "depth_rmse", "brightness_scale"),
         measures=("events",),
         notes=(
-            f"Settings may be chosen by looking at {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are "
-            "only ever scored.",
-            "without-instants pairs events with events, and looks at silent pixels, as all of enerf did before.",
-            "nerf-sharp learns from sharp frames alone: the ceiling of the field, sampler and renderer.",
+            f"Defaults may be chosen on {', '.join(CHOSEN_ON)} and {REAL}; {', '.join(ONLY_SCORED)} are only scored.",
+            "without-instants uses pairs of events and silent pairs, but no pairs of arbitrary instants.",
+            "nerf-sharp trains on sharp frames alone, which shows the limit of the field, sampler and renderer.",
         ),
     ),
     "parts": Experiment(
-        "Numerical error of the parts, which tells what limits a result: quadrature, poses, float32, brightness fit.",
+        "Numerical error of quadrature, poses, float32 and brightness fit, to find the part that limits a result.",
         ("events",),
         ("shapes", "shake-carpet1"),
         parts=True,
     ),
     "design": Experiment(
-        "What the method was chosen against, one change each, on the demo's scene or on any recording.",
+        "The method against single changes of its design, on the demo's scene or on any recording.",
         (
             "events",
             "successor-pairs",
@@ -415,7 +411,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "ssim", "lpips", "correlation", "depth_rmse"),
     ),
     "front": Experiment(
-        "What moves error against time: samples, batch, distance of pairs, levels of the hash grid.",
+        "Settings that trade error for time: samples, batch, distance of pairs, levels of the hash grid.",
         (
             "events",
             "16-samples",
@@ -433,7 +429,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "correlation", "depth_rmse"),
     ),
     "left-out": Experiment(
-        "What the parts would cost that a grey, bounded, rectified scene does not need.",
+        "Cost of the parts that a grey, bounded, rectified scene does not need.",
         (
             "everything-forced-on",
             *(f"without-{part}" for part in LEFT_OUT),
@@ -445,20 +441,20 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("psnr", "correlation", "depth_rmse", "ms_a_step", "megabytes_a_step"),
         measures=("memory",),
         notes=(
-            "Memory is what a step keeps for its backward pass, and the parameters with their gradients and running "
-            "means. In place of the proposal network are 64 even samples.",
+            "Memory is that of the values that a step keeps for its backward pass, parameters, gradients and moments "
+            "of Adam. 64 even samples replace the proposal network.",
         ),
     ),
     "unbounded": Experiment(
-        "Space beyond the box, left out or contracted.",
+        "Space beyond the box, ignored or contracted.",
         ("no-contraction", "contraction"),
         ("unbounded",),
         columns=("psnr", "ssim", "correlation", "near_depth_error"),
         measures=("near_depth",),
-        notes=("The depth error is the median, in metres, at things 1 to 2 m away; walls are at 30 and 300 m.",),
+        notes=("The depth error is the median in metres over objects 1 to 2 m away. Walls are at 30 and 300 m.",),
     ),
     "sensor": Experiment(
-        "An unknown sensor, taken for ideal, learned, and known: each of its faults alone, and together.",
+        "A sensor with single and with several faults, which training assumes to be ideal, learns, or knows.",
         ("fixed", "learned", "known"),
         tuple(SENSORS),
         columns=(
@@ -473,12 +469,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
         measures=("sensor",),
         notes=(
-            "The recordings state nothing of their sensor. fixed takes both thresholds for 0.25, all pixels for alike "
-            "and never blind, and the response for linlog; learned is told nothing; known is told what was simulated, "
-            "as far as the method has settings for it.",
-            "In brackets is the truth. The scale is the factor by which the brightness fit multiplies contrast, which "
-            "should be the true mean threshold over the one learnt with.",
-            "Maps of thresholds are compared with the true thresholds of the pixels by their correlation.",
+            "The recordings do not state their sensor. fixed assumes thresholds of 0.25 for all pixels, no refractory "
+            "period and a linlog response. learned learns the sensor. known has the simulated parameters, as far as "
+            "the method has settings for them.",
+            "The true value is in brackets. The scale is the factor by which the brightness fit multiplies contrast. "
+            "Its true value is the true mean threshold divided by the one that training used.",
+            "Columns of maps show the correlation of learned and true thresholds over pixels.",
         ),
     ),
 }

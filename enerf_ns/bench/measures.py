@@ -1,4 +1,4 @@
-"""What a finished run tells of itself: scores of its held-out frames, depths, the cost of a step."""
+"""Measurements of a finished run: scores of held-out frames, depth errors, the cost of a step."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.simulator.event_sensor import SensorSettings
 
 REPEATS = 9
-"""How often each part of a step is timed; what is told is the median."""
+"""Number of timings of each part of a step, of which the median is taken."""
 
 TRUTH = "truth.json"
-"""What was simulated, in a recording that states nothing of its sensor."""
+"""Name of the file with the settings of the simulation, in a recording that does not state its sensor."""
 
 ProtocolScores = dict[str, dict[str, float]]
 """Scores by protocol."""
@@ -42,14 +42,14 @@ def evaluate(
     """Scores of a run.
 
     Args:
-        run: Trained.
-        protocols: Names of protocols; measures that have none stand with each.
-        measures: Names of `MEASURES`.
+        run: Trained run.
+        protocols: Names of protocols.
+        measures: Names of `MEASURES`, whose values are added to the scores of each protocol.
         nets: Networks of LPIPS.
 
     Returns:
-        Mean scores over the held-out frames that have them, with what the measures add, ms_a_step and, where depths are
-        known, depth_rmse_all_poses (metres); and what is left out of the means, and why. Both by protocol.
+        By protocol, mean scores over held-out frames with the values of the measures, ms_a_step and, if depths are
+        known, depth_rmse_all_poses (metres); and by protocol, the missing scores with their reasons.
     """
     views, _ = held_out_views(run.pipeline)
     added = _depth_rmse_all_poses(run.pipeline, views) | {"ms_a_step": milliseconds_a_step(run)}
@@ -63,7 +63,7 @@ def evaluate(
 
 
 def _depth_rmse_all_poses(pipeline: EnerfPipeline, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """Mean of the depth errors at all held-out and train poses."""
+    """Mean depth error in metres over all held-out and training poses."""
     dataset = pipeline.datamanager.train_dataset
     pairs = [(view.depth, view.recorded_depth) for view in views]
     if dataset.are_frames and dataset.frames.depth_filenames is not None:
@@ -83,7 +83,7 @@ def _depth(pipeline: EnerfPipeline, dataset: EventDataset, index: int) -> torch.
 
 
 def _near_depth(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """Median depth error in metres of what is near in the unbounded scene."""
+    """Median depth error in metres of near surfaces in the unbounded scene."""
     errors = []
     for view in views:
         assert view.recorded_depth is not None
@@ -93,7 +93,7 @@ def _near_depth(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
 
 
 def _memory(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """Megabytes that a step keeps for its backward pass, and the parameters with gradients and running means."""
+    """Megabytes that a step keeps for its backward pass, plus parameters, gradients and moments of Adam."""
     run.pipeline.train()
     kept = kept_bytes(lambda: run.pipeline.get_train_loss_dict(0)[1], run.pipeline.model)
     parameters = sum(parameter.nbytes for parameter in run.pipeline.model.parameters())
@@ -101,8 +101,8 @@ def _memory(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
 
 
 def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """Percent of a training step that go into sampling events, their poses, rays but for these, frames' pixels, and the
-    rest."""
+    """Shares of a training step in percent: sampling of events, their poses, other work on rays, pixels of frames, and
+    the remaining forward and backward pass."""
     manager, sensor = run.pipeline.datamanager, run.pipeline.model.sensor
     supervision = manager.config.supervision
     parts: dict[str, float] = dict.fromkeys(("sample", "poses", "rays", "images"), 0.0)
@@ -123,8 +123,8 @@ def _step(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
 
 
 def _sensor(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """What the run has for the parameters of the sensor, with the true ones as true_NAME; the brightness scale, with
-    what it should be; and the correlation of its threshold map with the thresholds of the pixels."""
+    """Sensor parameters and brightness scale of the run, with the true or expected values as true_NAME, and the
+    correlation of its threshold map with the true thresholds of the pixels."""
     sensor, recording = run.pipeline.model.sensor, run.config.data
     assert recording is not None
     simulated = SensorSettings(**json.loads((recording / TRUTH).read_text())["sensor"])
@@ -153,7 +153,7 @@ def _sensor(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
 
 
 def _map_correlation(sensor: SensorModel, recording: Path) -> dict[str, float]:
-    """Over pixels, of each polarity; nothing where the sensor has no map, or the recording's pixels are alike."""
+    """Correlation over pixels for each polarity; empty if the sensor has no map or all pixels have one threshold."""
     thresholds, found = recording / "thresholds.npy", sensor.threshold_map
     if found is None or not thresholds.exists():
         return {}
@@ -162,20 +162,20 @@ def _map_correlation(sensor: SensorModel, recording: Path) -> dict[str, float]:
 
 
 def _events(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """How well held-out events are rendered, as far as that can be told, and the scale of the brightness fit."""
+    """Available scores over held-out events, and the brightness scale."""
     found = {name: float(score) for name, score in run.pipeline.event_scores().items() if not isinstance(score, str)}
     scale = aligned_views(views)[1].get("brightness_scale")
     return found if scale is None else {**found, "brightness_scale": float(scale)}
 
 
 def milliseconds_a_step(run: Run) -> float:
-    """Of the training of a run."""
+    """Mean time of a training step, ms."""
     assert run.train_seconds is not None
     return 1e3 * run.train_seconds / run.config.max_num_iterations
 
 
 def _milliseconds(call: Callable[[], object], run: Run) -> float:
-    """Median wall time of a call, after one that warms up."""
+    """Median wall time of a call in ms, after one warm-up call."""
     times = [seconds_of(call, run.pipeline.device) for _ in range(REPEATS + 1)]
     return 1e3 * statistics.median(times[1:])
 
@@ -187,4 +187,4 @@ MEASURES: dict[str, Callable[[Run, Sequence[HeldOutView]], dict[str, float]]] = 
     "sensor": _sensor,
     "events": _events,
 }
-"""What is told beside scores, by name."""
+"""Measurements that can be added to scores, by name."""

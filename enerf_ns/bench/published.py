@@ -1,4 +1,4 @@
-"""Scores that others published, as the tables of `enerf bench` print them beside ours.
+"""Published scores, which the tables of `enerf bench` show beside ours.
 
 E-NeRF: Klenk, Koestler, Scaramuzza, Cremers, "E-NeRF: Neural Radiance Fields from a Moving Event Camera", RA-L 2023.
 """
@@ -12,7 +12,7 @@ Published = dict[str, dict[str, Scores]]
 """Scores by sequence and row."""
 
 MEAN = "mean"
-"""Stands for a sequence, where scores are means over all sequences."""
+"""Name in place of a sequence for means over all sequences."""
 
 PSNR_SSIM_LPIPS = ("psnr", "ssim", "lpips")
 
@@ -20,7 +20,7 @@ PSNR_SSIM_LPIPS = ("psnr", "ssim", "lpips")
 def _table(
     sequences: Sequence[str], rows: Mapping[str, Sequence[Sequence[float]]], scores: Sequence[str] = PSNR_SSIM_LPIPS
 ) -> Published:
-    """A table as it is printed: a row for each method, of one tuple of scores for each sequence."""
+    """Scores by sequence and row, from rows with one tuple of scores for each sequence."""
     published: Published = {sequence: {} for sequence in sequences}
     for row, values in rows.items():
         for sequence, of_sequence in zip(sequences, values, strict=True):
@@ -39,7 +39,7 @@ SPIRAL = _table(
         "events+blurred": [(28.23, 0.85, 0.04), (27.92, 0.82, 0.03), (27.34, 0.85, 0.04), (27.27, 0.83, 0.04)],
     },
 )
-"""E-NeRF, table of the spirals; its deblurring baseline is Deblur-NeRF, which guesses the blur's kernel."""
+"""E-NeRF, table of the spirals; its deblurring baseline is Deblur-NeRF, which estimates the kernel of the blur."""
 
 SHAKE = _table(
     ("shake-moon1", "shake-moon2", "shake-carpet1"),

@@ -1,4 +1,4 @@
-"""Runs the experiments of `enerf bench`: each row, sequence and seed once, and only what is not finished."""
+"""Runs the experiments of `enerf bench`. Trainings that are already finished are not repeated."""
 
 from __future__ import annotations
 
@@ -38,27 +38,26 @@ from enerf_ns.method.stopwatch import seconds_of
 from enerf_ns.method.trainer import EnerfTrainerConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
-from enerf_ns.simulator.settings import SimulationSettings
 
 FULL_SIZE = (640, 480)
-"""Width and height of the simulated sequences at scale 1, pixels."""
+"""Width and height in pixels of simulated sequences at scale 1."""
 
 WARM_UP, TIMED = 5, 20
-"""Steps that are left out, and steps that are timed, to find out how many fit a budget of seconds."""
+"""Number of warm-up steps and of timed steps, to find how many steps fit into a budget of seconds."""
 
 LATE = 1001
-"""Number of the first of them: as a run goes on, the proposal network learns at some steps only."""
+"""Number of the first of these steps. Late in a run, the proposal network learns only at some steps."""
 
 STATED_OF_SENSOR = ("contrast_thresholds", "refractory_period_ns", "response", "sensor")
-"""What recording.json and simulation.json hold of a sensor, but for its colour filter."""
+"""Keys of the sensor in recording.json and simulation.json, except the colour filter."""
 
 RESULT, LOG = "result.json", "log.txt"
-"""What a run's folder has besides the run itself."""
+"""Names of the files of the result and of the output in the folder of a run."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training of a row."""
+    """One training: a row on a sequence with a seed."""
 
     row: str
     sequence: str
@@ -69,11 +68,11 @@ class Bench:
     """One experiment with its settings.
 
     Args:
-        name: Of the experiment.
-        settings: Of the bench.
+        name: Name of the experiment.
+        settings: Settings of the bench.
 
     Raises:
-        FlagError: There is no such experiment, row or sequence; or a setting is out of its range.
+        FlagError: The experiment, row or sequence does not exist, or a setting is out of its range.
     """
 
     def __init__(self, name: str, settings: BenchSettings):
@@ -102,7 +101,7 @@ class Bench:
             raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
         parse_budget(settings.budget)
         self.before = _results_of(settings.against)
-        """What --against holds; None where it is not given."""
+        """Results in the file of --against; None if not given."""
         if not 0.0 < settings.scale <= 4.0:
             raise FlagError(f"--scale is {settings.scale:g}, but must be above 0 and at most 4.")
         if settings.seeds < 1:
@@ -118,7 +117,7 @@ class Bench:
 
     @property
     def cells(self) -> list[Cell]:
-        """All trainings, those on one recording after another."""
+        """All trainings, ordered by sequence."""
         return [
             Cell(row, sequence, seed)
             for sequence in self.sequences
@@ -127,10 +126,10 @@ class Bench:
         ]
 
     def run(self) -> Iterator[tuple[Cell, dict[str, Any] | None]]:
-        """Trains and scores what is not finished, and writes the tables after each training.
+        """Runs and scores all trainings that are not finished, and writes the tables after each training.
 
         Yields:
-            Each training that is begun, with None; then, as those that are finished already, with its result.
+            Each training with None when it begins, and each training with its result when it is finished.
 
         Raises:
             OutputError: The output folder cannot be written to.
@@ -156,7 +155,7 @@ class Bench:
             self._write(self.output_dir / f"{self.name}.png", picture)
 
     def results(self, runs: list[dict[str, Any]]) -> dict[str, Any]:
-        """What is told of the experiment: all that its table is made of."""
+        """Contents of the result file, from which the tables are made."""
         experiment, settings = self.experiment, self.settings
         weights = settings.reconstruction_weights
         not_asked = {*experiment.rows} - {*self.rows, *self.left_out}
@@ -182,7 +181,7 @@ class Bench:
         }
 
     def _command(self) -> str:
-        """The command that makes the same, wherever the data lie."""
+        """The command that makes these results, without the user's own paths."""
         words, default = ["enerf", "bench", self.name], BenchSettings()
         for name, value in vars(self.settings).items():
             if name in ("output_dir", "threads", "against") or (
@@ -198,7 +197,7 @@ class Bench:
         return ROWS[cell.row].method or self.settings.method
 
     def _simulation(self, cell: Cell) -> dict[str, Any] | None:
-        """Settings of the simulation of a cell's recording; None where it is the user's."""
+        """Settings of the simulation of the recording; None if the recording is the user's."""
         sequence = SEQUENCES[cell.sequence]
         if sequence.scene is None:
             return None
@@ -207,13 +206,13 @@ class Bench:
         return {"scene": sequence.scene, "width": width, "height": height, **sequence.simulation, **sensor}
 
     def _changes(self, cell: Cell) -> dict[str, Any]:
-        """What a cell changes of the method."""
+        """Settings of a cell that differ from the method."""
         row, sequence = ROWS[cell.row], SEQUENCES[cell.sequence]
         known = known_sensor(SensorSettings(**(sequence.sensor or {}))) if row.known_sensor else {}
         return {**sequence.changes, **row.changes, **known, "machine.seed": cell.seed}
 
     def _about(self, cell: Cell) -> dict[str, Any]:
-        """All that a result depends on, but for the version of the code."""
+        """Everything that a result depends on, except the version of the code."""
         row, sequence, settings = ROWS[cell.row], SEQUENCES[cell.sequence], self.settings
         simulation = self._simulation(cell)
         weights = settings.reconstruction_weights if row.reconstruction == "e2vid" else None
@@ -236,12 +235,12 @@ class Bench:
         return json.loads(json.dumps(about))
 
     def _folder(self, cell: Cell) -> Path:
-        """Folder of a cell's run, of the layout of Nerfstudio."""
+        """Folder of the run of a cell, in the layout of Nerfstudio."""
         name = f"{cell.row.replace('/', '-over-')}-seed-{cell.seed}-{_digest(self._about(cell))}"
         return self.output_dir / "runs" / cell.sequence / self._method(cell) / name
 
     def _finished(self, cell: Cell) -> dict[str, Any] | None:
-        """The result of a cell; None where it has none, or failed."""
+        """The stored result of a cell; None if there is none or the training failed."""
         try:
             result = json.loads((self._folder(cell) / RESULT).read_text())
         except (OSError, ValueError):
@@ -249,7 +248,7 @@ class Bench:
         return None if "failure" in result else result
 
     def _attempt(self, cell: Cell) -> dict[str, Any]:
-        """Trains and scores; what becomes of it is stored."""
+        """Trains and scores a cell, and stores its result or its failure."""
         folder, about = self._folder(cell), self._about(cell)
         result = {**asdict(cell), "settings": about, "version": code_version()}
         result |= {"device": about["device"], "threads": about["threads"]}
@@ -262,13 +261,13 @@ class Bench:
             if end.code == 130:
                 raise KeyboardInterrupt from end
             result["failure"] = str(end.code).removeprefix("enerf: ")
-        except Exception as error:  # whatever a row dies of, the others are run
+        except Exception as error:  # the other rows are run after any failure
             result["failure"] = " ".join(str(error).split()) or type(error).__name__
         self._write(folder / RESULT, json.dumps(result, indent=1) + "\n")
         return result
 
     def _trained(self, cell: Cell, folder: Path) -> dict[str, Any]:
-        """Seconds, steps and scores of a cell's run, which is in the folder afterwards."""
+        """Trains a cell in a folder, and returns its seconds, steps and scores."""
         config = self._config(cell, folder)
         config.max_num_iterations = steps_of(self.settings.budget, config)
         run = train(config)
@@ -291,7 +290,7 @@ class Bench:
         config = method_config(self._method(cell), self._recording(cell), self.output_dir / "runs", changes)
         config.experiment_name, config.timestamp = cell.sequence, folder.name
         if sequence.scene is not None and config.pipeline.model.view_direction is None:
-            config.pipeline.model.view_direction = False  # what is simulated is matt, so that all rows have one field
+            config.pipeline.model.view_direction = False  # simulated surfaces are matt; so all rows have the same field
         if row.factors:
             resolved = config.resolved().pipeline
             chosen = resolved.resolution.applied_to(resolved)
@@ -305,13 +304,13 @@ class Bench:
         return config
 
     def _recorded(self, cell: Cell) -> Path:
-        """Where the user has a recording."""
+        """Path of the user's recording."""
         assert self.settings.data is not None
         data = absolute(self.settings.data)
         return data / cell.sequence if (data / cell.sequence).is_dir() or len(self.experiment.recorded) > 1 else data
 
     def _recording(self, cell: Cell) -> Path:
-        """The recording that a cell is trained on, made where it is not there."""
+        """Path of the recording of a cell, which is made first if necessary."""
         row, sequence, simulation = ROWS[cell.row], SEQUENCES[cell.sequence], self._simulation(cell)
         if simulation is None:
             recording = self._recorded(cell)
@@ -320,16 +319,10 @@ class Bench:
             recording = self.output_dir / "recordings" / f"{stem}-{_digest([simulation, sequence.files])}"
             with _made_whole(recording) as folder:
                 if folder is not None:
-                    given: dict[str, Any] = {
-                        name: str(self._file(value, sequence.files[value]))
-                        if isinstance(value, str) and value in sequence.files
-                        else value
-                        for name, value in simulation.items()
-                    }
-                    if "key_frames" in given:
-                        given["key_frames"] = Path(given["key_frames"])
-                    given["sensor"] = SensorSettings(**(sequence.sensor or {}))
-                    simulate(SimulationSettings(**given), folder)
+                    size = {name: simulation[name] for name in ("width", "height")}
+                    with self._writing_to(recording.parent):
+                        settings = sequence.simulation_settings(recording.parent, **size)
+                    simulate(settings, folder)
                     if sequence.sensor is not None:
                         hide_sensor(folder)
         if row.reconstruction is None:
@@ -345,14 +338,14 @@ class Bench:
                 reconstruct(recording, folder, weights and expanded(weights))
         return frames
 
-    def _file(self, name: str, content: str) -> Path:
-        path = self.output_dir / "recordings" / name
-        self._write(path, content)
-        return path
-
     def _write(self, path: Path, content: str | bytes) -> None:
-        try:
+        with self._writing_to(path):
             write_whole(path, content)
+
+    @contextlib.contextmanager
+    def _writing_to(self, path: Path) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise OutputError(
                 f"{path} could not be written ({error.strerror}); make room, or give another --output-dir."
@@ -360,10 +353,10 @@ class Bench:
 
 
 def _results_of(against: Path | None) -> dict[str, Any] | None:
-    """The results that a file holds.
+    """The results in a result file; None if no file is given.
 
     Raises:
-        FlagError: It holds none.
+        FlagError: The file has no results.
     """
     if against is None:
         return None
@@ -382,20 +375,20 @@ def _results_of(against: Path | None) -> dict[str, Any] | None:
 
 
 def parse_budget(budget: str) -> tuple[float, bool]:
-    """Amount of a budget, and whether it is in seconds, not steps.
+    """Amount of a budget, and whether its unit is seconds instead of steps.
 
     Raises:
-        FlagError: It is neither.
+        FlagError: The budget is no such amount.
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)(s?)", budget)
     amount, in_seconds = (float(found[1]), found[2] == "s") if found else (0.0, False)
     if amount <= 0.0 or not (in_seconds or amount.is_integer()):
-        raise FlagError(f"--budget is {budget}, but seconds, as in 120s, or steps, as in 600, were expected.")
+        raise FlagError(f"--budget is {budget}, but must be seconds, such as 120s, or steps, such as 600.")
     return amount, in_seconds
 
 
 def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
-    """Steps that a run may take, where need be measured with a short one that is thrown away."""
+    """Number of steps for a budget. For a budget in seconds, a short trial run measures the time of a step."""
     amount, in_seconds = parse_budget(budget)
     if not in_seconds:
         return int(amount)
@@ -410,14 +403,16 @@ def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
             times.append(seconds_of(lambda step=step: trainer.train_iteration(step), device))
             for callback in trainer.callbacks:
                 callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-        # a pair of steps, of which the proposal network learns at one; the median, which a hiccup does not move
+        # pairs, because the proposal network learns at every second step; median, to ignore interruptions
         pairs = [sum(pair) for pair in zip(times[WARM_UP::2], times[WARM_UP + 1 :: 2], strict=True)]
         return max(1, round(amount / (0.5 * median(pairs))))
 
 
 def hide_sensor(recording: Path) -> None:
-    """Takes what a simulated recording states of its sensor, but for a colour filter, out of its files, and leaves all
-    settings of the simulation in `TRUTH`, which no reader knows."""
+    """Removes the sensor, except its colour filter, from the files of a simulated recording.
+
+    The settings of the simulation are copied to `TRUTH`, which no reader of recordings knows.
+    """
     write_whole(recording / TRUTH, (recording / "simulation.json").read_bytes())
     for name in ("simulation.json", "recording.json"):
         if (recording / name).exists():
@@ -427,7 +422,7 @@ def hide_sensor(recording: Path) -> None:
 
 
 def code_version() -> str:
-    """Version of the package, and where it runs from its repository the commit, -dirty if that was changed."""
+    """Version of the package, with the commit if it runs from its repository, and -dirty if files were changed."""
     root = Path(enerf_ns.__file__).parents[1]
 
     def git(*arguments: str) -> str:
@@ -443,19 +438,19 @@ def code_version() -> str:
 
 
 def device_name() -> str:
-    """The device that methods train on by default."""
+    """Name of the default training device."""
     return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
 
 
 def _some(flag: str, chosen: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of what is known that a flag names, in their order; all where it names none.
+    """The known names that a flag chooses, in their order; all if it chooses none.
 
     Raises:
-        FlagError: It names one that is not known.
+        FlagError: A chosen name is not known.
     """
     unknown = [name for name in chosen if name not in known]
     if unknown:
-        raise FlagError(f"--{flag} {' '.join(unknown)} is not of this experiment; choose of {', '.join(known)}.")
+        raise FlagError(f"--{flag} {' '.join(unknown)} is not part of this experiment; choose from {', '.join(known)}.")
     return tuple(name for name in known if not chosen or name in chosen)
 
 

@@ -1,4 +1,4 @@
-"""The flags of `enerf bench`; apart from what runs them, so that they are told without loading Nerfstudio."""
+"""Settings of `enerf bench`, in a module of their own so that --help need not load Nerfstudio."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ from typing import Optional, Tuple  # noqa: UP035 - tyro reads these annotations
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """What is run, and for how long."""
+    """Rows, recordings and training time of an experiment."""
 
     data: Optional[Path] = None  # noqa: UP045
-    """Recording, or folder of recordings, of an experiment on real ones."""
+    """Recording, or folder of recordings, for an experiment on real recordings."""
     budget: str = "120s"
-    """Training of each row: seconds, as in 120s, or steps, as in 600."""
+    """Training time of each row in seconds, such as 120s, or its number of steps, such as 600."""
     scale: float = 0.25
-    """Size of the simulated sequences, of 640 x 480."""
+    """Size of the simulated pictures as a factor of 640 x 480 pixels."""
     seeds: int = 1
-    """Trainings of each row; scores are their means, with standard deviations."""
+    """Number of trainings of each row. The table shows means and standard deviations of their scores."""
     sequences: Tuple[str, ...] = ()  # noqa: UP006
-    """Some of the experiment's sequences. None: all."""
+    """Sequences to train on. Default: all sequences of the experiment."""
     rows: Tuple[str, ...] = ()  # noqa: UP006
-    """Some of the experiment's rows. None: all."""
+    """Rows to train. Default: all rows of the experiment."""
     method: str = "enerf"
-    """Method of ns-train: enerf, or enerf-paper at full size on a GPU."""
+    """Method of ns-train: enerf, or on a GPU enerf-paper at full size."""
     reconstruction_weights: Optional[Path] = None  # noqa: UP045
-    """Weights of E2VID or FireNet, by which frames are reconstructed from events; without, that row is left out."""
+    """File with the weights of E2VID or FireNet, for the row e2vid, which learns from frames that this network
+    reconstructs. Default: the row e2vid is left out."""
     threads: Optional[int] = None  # noqa: UP045
-    """Threads of the processor. None: as many as it has cores."""
+    """Number of CPU threads. Default: the number of CPU cores."""
     against: Optional[Path] = None  # noqa: UP045
-    """Result file (.json) of another version: the change of each row is shown, worst first, and the exit code is not 0
-    where one lost more than 0.3 dB."""
+    """Result file (.json) of another version. The change of the PSNR of each row since that version is shown, largest
+    loss first. The exit code is not 0 if a row lost more than 0.3 dB."""
     output_dir: Path = Path("outputs/bench")
-    """Folder for the tables, recordings and runs; what is finished there is not run again."""
+    """Folder for the tables, recordings and runs. Runs that are finished there are not run again."""

@@ -1,23 +1,19 @@
-"""Tables of an experiment's results, as functions of its result file alone: for the terminal, Markdown and CSV."""
+"""Tables of the results of an experiment, made from its result file alone."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 from statistics import mean, stdev
 from typing import Any
 
-from rich.markup import escape
-from rich.table import Table
-
 from enerf_ns.bench.numerics.case import shown
 from enerf_ns.bench.published import MEAN
+from enerf_ns.report.tables import NONE, Table, csv_text
 
 Results = dict[str, Any]
-"""What a result file holds (`Bench.results`)."""
+"""Contents of a result file (`Bench.results`)."""
 
 DIGITS = {
     "psnr": 2,
@@ -27,7 +23,7 @@ DIGITS = {
     "refractory_ms": 2,
     **dict.fromkeys(("sample", "poses", "rays", "images", "forward_and_backward"), 2),
 }
-"""Digits behind the point, where they are not 3."""
+"""Number of decimals of scores, if not 3."""
 
 TITLES = {
     "psnr": "PSNR, dB",
@@ -43,11 +39,11 @@ TITLES = {
     "brightness_scale": "scale",
     "event_correlation": "correlation of held-out events",
     "threshold_ratio": "C_on / C_off",
-    "refractory_ms": "blind, ms",
+    "refractory_ms": "refractory period, ms",
     "threshold_map_on": "map of C_on",
     "threshold_map_off": "map of C_off",
 }
-"""Names of scores for a reader, where they are not their own."""
+"""Titles of scores, if not their names."""
 
 LARGEST_LOSS = 0.3
 """PSNR (dB, mean over the seeds) that a row may lose against another version."""
@@ -63,15 +59,17 @@ class Line:
     row: str
     protocol: str
     scores: dict[str, list[float]] = field(default_factory=dict)
-    """By name, one a seed."""
+    """Scores by name, one for each seed."""
     published: dict[str, float] = field(default_factory=dict)
+    """Published scores by name."""
     seconds: list[float] = field(default_factory=list)
-    """Of training, one a run."""
+    """Training time of each run, s."""
     steps: list[int] = field(default_factory=list)
+    """Number of training steps of each run."""
 
 
 def lines(results: Results) -> list[Line]:
-    """The lines of the table: by sequence, rows in their order, then what others published alone."""
+    """The lines of the table by sequence: first the rows of the experiment, then rows that are only published."""
     runs, published = results["runs"], results["published"]
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     rows = list(dict.fromkeys(run["row"] for run in runs))
@@ -94,7 +92,7 @@ def lines(results: Results) -> list[Line]:
 
 
 def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
-    """Adds the scores of each seed that has all sequences, their mean over these."""
+    """Adds the mean scores over the sequences, for each seed that has all sequences."""
     for seed in dict.fromkeys(run["seed"] for run in runs):
         done = [run for run in runs if run["seed"] == seed and "failure" not in run]
         if len(done) < num_sequences:
@@ -110,7 +108,7 @@ def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
 
 @dataclass(frozen=True)
 class Change:
-    """What became of a row since another version: means over the seeds of the PSNR, dB."""
+    """PSNR of a row in another version and now, means over seeds in dB."""
 
     sequence: str
     row: str
@@ -119,12 +117,12 @@ class Change:
 
     @property
     def loses(self) -> bool:
-        """Whether the row lost more than it may."""
+        """Whether the row lost more than `LARGEST_LOSS`."""
         return self.now < self.before - LARGEST_LOSS
 
 
 def changes_since(results: Results, before: Results) -> list[Change]:
-    """What became of each row that both tables have, worst first."""
+    """The change of each row that both results have, largest loss first."""
     then = {(line.sequence, line.row): line.scores["psnr"] for line in lines(before) if line.scores.get("psnr")}
     now = {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
     found = [Change(*key, mean(then[key]), mean(now[key])) for key in now if key in then]
@@ -132,19 +130,18 @@ def changes_since(results: Results, before: Results) -> list[Change]:
 
 
 def changes_table(changes: list[Change], file: str) -> Table:
-    """The table of `changes_since` for the terminal."""
-    table = Table(title=f"PSNR against {escape(file)}, worst first", title_justify="left")
-    for name in ("sequence", "row", "before, dB", "now, dB", "change"):
-        table.add_column(name, justify="left" if name in ("sequence", "row") else "right")
+    """The changes since the results in a file, as `changes_since` orders them."""
+    rows = []
     for change in changes:
         mark = f"  more than {LARGEST_LOSS:g} dB lost" * change.loses
         numbers = f"{change.before:.2f}", f"{change.now:.2f}", f"{change.now - change.before:+.2f}{mark}"
-        table.add_row(escape(change.sequence), escape(change.row), *numbers)
-    return table
+        rows.append([change.sequence, change.row, *numbers])
+    header = ["sequence", "row", "before, dB", "now, dB", "change, dB"]
+    return Table(f"PSNR against {file}, largest loss first", header, rows, num_words=2)
 
 
-def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
-    """Head of the table, and its lines."""
+def scores_table(results: Results) -> Table:
+    """The scores of all rows and sequences beside the published ones."""
     table, columns = lines(results), results["columns"]
     theirs = [name for name in columns if any(name in line.published for line in table)]
     several = len(results["protocols"]) > 1
@@ -155,11 +152,11 @@ def _cells(results: Results) -> tuple[list[str], list[list[str]]]:
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
         cells += [_score(name, line.scores.get(name, [])) + _truth(name, line) for name in columns]
-        cells += [f"{mean(line.seconds):.0f}" if line.seconds else "-"]
-        cells += [f"{mean(line.steps):.0f}" if line.steps else "-"]
-        cells += [_published(name, line.published[name]) if name in line.published else "-" for name in theirs]
+        cells += [f"{mean(line.seconds):.0f}" if line.seconds else NONE]
+        cells += [f"{mean(line.steps):.0f}" if line.steps else NONE]
+        cells += [_published(name, line.published[name]) if name in line.published else NONE for name in theirs]
         content.append(cells)
-    return head, content
+    return Table(f"{results['experiment']}: {results['sentence']}", head, content, num_words=2)
 
 
 def _title(name: str) -> str:
@@ -168,27 +165,26 @@ def _title(name: str) -> str:
 
 def _score(name: str, values: list[float]) -> str:
     if not values:
-        return "-"
+        return NONE
     digits = DIGITS.get(name, 3)
     spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{mean(values):.{digits}f}{spread}"
 
 
 def _truth(name: str, line: Line) -> str:
-    """What a score should be, where that is known."""
+    """The true value of a score in brackets, if known."""
     values = line.scores.get(f"true_{name}")
     return f" ({_score(name, [mean(values)])})" if values else ""
 
 
 def _published(name: str, value: float) -> str:
-    """As it was printed: with two digits at least, where ours have some."""
+    """A published score as printed there, with at least two decimals if ours has decimals."""
     digits = len(f"{value:g}".partition(".")[2])
     return f"{value:.{max(digits, 2) if DIGITS.get(name, 3) else 0}f}"
 
 
 def disagreements(results: Results) -> list[str] | None:
-    """Where one row is better than another here and worse as published, a sentence each; None where nothing can be
-    compared."""
+    """A sentence for each pair of rows whose order differs from the published one; None if nothing can be compared."""
     name = results["columns"][0]
     lower = name in LOWER_IS_BETTER
     compared, found = 0, []
@@ -214,7 +210,7 @@ def disagreements(results: Results) -> list[str] | None:
 
 
 def remarks(results: Results) -> Iterator[str]:
-    """What belongs to the table, a sentence each: how it was made, what is missing, where the order is another."""
+    """Sentences about the table: how it was made, what is missing, and which order differs from the published one."""
     runs, name = results["runs"], _title(results["columns"][0]).partition(",")[0]
     seeds = 1 + max((run["seed"] for run in runs), default=0)
     size = "" if results["scale"] is None else f" at scale {results['scale']:g} of 640 x 480"
@@ -245,51 +241,34 @@ def remarks(results: Results) -> Iterator[str]:
 
 
 def markdown(results: Results) -> str:
-    """The command, the table and what belongs to it."""
-    head, content = _cells(results)
-    tables = [
-        _printed(head, content),
-        *([_printed(*_parts(results))] if any("parts" in run for run in results["runs"]) else []),
-    ]
-    return "\n\n".join([f"    {results['command']}", *tables, "".join(f"* {remark}\n" for remark in remarks(results))])
+    """The command, the tables and the remarks as Markdown."""
+    tables = [scores_table(results)]
+    if any("parts" in run for run in results["runs"]):
+        tables.append(_parts_table(results))
+    about = "".join(f"* {remark}\n" for remark in remarks(results))
+    return "\n\n".join([f"    {results['command']}", *(table.markdown() for table in tables), about])
 
 
-def _printed(head: list[str], content: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [head, ["---"] * len(head), *content])
-
-
-def _parts(results: Results) -> tuple[list[str], list[list[str]]]:
-    """Head and lines of the numerical errors of the parts of each run; of one seed of each row and sequence."""
+def _parts_table(results: Results) -> Table:
+    """The numerical errors of the parts of each run, for the first seed of each row and sequence."""
     runs = [run for run in results["runs"] if run["seed"] == 0 and "parts" in run]
     lines: dict[tuple[str, str, str], list[str]] = {}
     for place, run in enumerate(runs):
         for part in run["parts"]:
             kind = part["name"], part["compared"], part["unit"].partition(" at ")[0]
-            lines.setdefault(kind, ["-"] * len(runs))[place] = shown(part["error"], part["unit"])
+            lines.setdefault(kind, [NONE] * len(runs))[place] = shown(part["error"], part["unit"])
     head = ["part", "compared with", *(f"{run['sequence']}, {run['row']}" for run in runs)]
-    return head, [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
-
-
-def rich_table(results: Results) -> Table:
-    """The table for the terminal."""
-    head, content = _cells(results)
-    table = Table(title=f"{results['experiment']}: {results['sentence']}", title_justify="left")
-    for number, name in enumerate(head):
-        table.add_column(name, justify="left" if number < 2 else "right")
-    for cells in content:
-        table.add_row(*map(escape, cells))
-    return table
+    rows = [[name, compared, *cells] for (name, compared, _), cells in lines.items()]
+    return Table("Numerical error of the parts", head, rows, num_words=2)
 
 
 def csv_table(results: Results) -> str:
-    """A line for each run and protocol, with all its scores."""
+    """All scores as CSV, with one line for each run and protocol."""
     runs = [run for run in results["runs"] if "failure" not in run]
     names = dict.fromkeys(name for run in runs for scores in run["scores"].values() for name in scores)
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["sequence", "row", "seed", "protocol", "steps", "seconds", *names])
+    table = [["sequence", "row", "seed", "protocol", "steps", "seconds", *names]]
     for run in runs:
         for protocol, scores in run["scores"].items():
             about = [run["sequence"], run["row"], run["seed"], protocol, run["steps"], run["seconds"]]
-            writer.writerow([*about, *(scores.get(name, "") for name in names)])
-    return table.getvalue()
+            table.append([*about, *(scores.get(name, "") for name in names)])
+    return csv_text(table)

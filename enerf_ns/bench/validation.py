@@ -1,8 +1,8 @@
-"""The validation set: recordings that differ in what matters, by which defaults are chosen and held to account.
+"""The validation set: different recordings on which changes of defaults are chosen and checked.
 
-A default that is chosen on one scene may lose on others. So a change of one is taken only where no recording of
-`CHOSEN_ON` and of `ONLY_SCORED` loses more than `tables.LARGEST_LOSS` (`enerf bench validation --against FILE`).
-Settings are chosen by looking at the first half alone; the second is only ever scored.
+A default that is good for one scene may be bad for others. So a default is changed only if no recording of `CHOSEN_ON`
+and `ONLY_SCORED` loses more than `tables.LARGEST_LOSS` (`enerf bench validation --against FILE`). Defaults are
+chosen on the recordings of `CHOSEN_ON` alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from enerf_ns.bench.experiment import Sequence as Recording
 
 KEYS_PER_SECOND = 40
-"""Key frames that paths here are sampled at."""
+"""Key frames per second of the paths."""
 
 Vector = tuple[float, float, float]
 
@@ -35,7 +35,7 @@ UPRIGHT, TURNED = {"rotation": [90, 0, 0]}, {"rotation": [0, 0, 25]}
 
 
 def _swing(seconds: float, camera: Vector, target: Vector, reach: Vector, gaze: Vector, hertz: Vector) -> str:
-    """Key frames of a camera that swings about a place, and looks about a target, on each axis at its own frequency."""
+    """Key frames of a camera whose position and target oscillate, with a frequency for each axis."""
     rows = []
     for step in range(round(seconds * KEYS_PER_SECOND) + 1):
         time = step / KEYS_PER_SECOND
@@ -48,12 +48,12 @@ def _swing(seconds: float, camera: Vector, target: Vector, reach: Vector, gaze: 
 
 
 def _straight(seconds: float, begin: Vector, end: Vector, target: Vector, target_end: Vector) -> str:
-    """Key frames of a camera that goes from one place to another, and its target too."""
+    """Key frames of a camera whose position and target move along straight lines."""
     return _lines([(0.0, *begin, *target), (seconds, *end, *target_end)])
 
 
 def _around(seconds: float, radius: float, height: float, bob: float) -> str:
-    """Key frames of a camera that goes once around the origin, up and down meanwhile."""
+    """Key frames of a camera that circles the origin once while it moves up and down."""
     rows = []
     for step in range(round(seconds * KEYS_PER_SECOND) + 1):
         turn = 2.0 * math.pi * step / (seconds * KEYS_PER_SECOND)
@@ -86,7 +86,7 @@ def _recording(
     changes: Mapping[str, Any] | None = None,
     **simulation: Any,
 ) -> Recording:
-    """A sequence of these parts along a path; of an ideal sensor, which it states, unless a sensor is given."""
+    """A sequence of a scene along a path. Its sensor is ideal and stated, unless a sensor is given."""
     scene = {"parts": list(parts), "camera": [0, 0, 0], "target": [0, 1, 0]}
     if not light:
         scene["light"] = None
@@ -208,7 +208,7 @@ CHOSEN_ON: dict[str, Recording] = {
         light=False,
     ),
 }
-"""Recordings that defaults may be chosen by looking at."""
+"""Recordings on which defaults may be chosen."""
 
 ONLY_SCORED: dict[str, Recording] = {
     "clutter": _recording(
@@ -266,7 +266,7 @@ ONLY_SCORED: dict[str, Recording] = {
         },
     ),
 }
-"""Recordings that are scored alone: no setting is chosen by looking at them."""
+"""Recordings that are only scored. No default is chosen on them."""
 
 REAL = "slider_depth"
-"""A real recording beside the simulated ones, of those that defaults may be chosen by; it needs --data."""
+"""Name of a real recording on which defaults may be chosen. It needs --data."""

@@ -1,4 +1,4 @@
-"""Error against time of a run, as it is recorded while the run trains: history.jsonl in the run's folder."""
+"""The history of a run: losses and scores against time, recorded during training in history.jsonl."""
 
 from __future__ import annotations
 
@@ -14,47 +14,49 @@ if TYPE_CHECKING:
     from enerf_ns.evaluation.scores import NotScored
 
 HISTORY_FILE = "history.jsonl"
-"""Name of the file in a run's folder, one `HistoryRow` a line."""
+"""Name of the file in the folder of a run, with one `HistoryRow` on each line."""
 
 
 @dataclass(frozen=True)
 class HistoryRow:
-    """What was known of a run at one moment of its training."""
+    """Losses and scores of a run at one moment of its training."""
 
     step: int
-    """Training steps done by then."""
+    """Number of training steps done."""
     seconds: float
-    """Time spent on training steps by then; evaluation, checkpoints and the viewer excluded."""
+    """Time spent on training steps, without evaluation, checkpoints and the viewer."""
     losses: dict[str, float] = field(default_factory=dict)
-    """Each term of the last step's loss, with its weight."""
+    """Weighted terms of the loss of the last step, by name."""
     scores: dict[str, float] = field(default_factory=dict)
-    """Scores by name, those that there are of psnr (dB), ssim, lpips, correlation and depth_rmse (metres) over the
-    held-out frames looked at, and the `enerf_ns.evaluation.metrics.event_scores` over held-out events; at the end the
-    other numbers of `enerf_ns.evaluation.scores.summary_scores` too."""
+    """Available scores by name: psnr (dB), ssim, lpips, correlation and depth_rmse (metres) over the scored held-out
+    frames, and the `enerf_ns.evaluation.metrics.event_scores` over held-out events. The last row of a run also has the
+    other numbers of `enerf_ns.evaluation.scores.summary_scores`."""
     num_frames: int = 0
-    """Held-out frames looked at."""
+    """Number of scored held-out frames."""
     parts: dict[str, float] = field(default_factory=dict)
-    """Seconds of one step by what they were spent on, in the order in which it is done; empty where not measured."""
+    """Seconds of one step by part, in the order of the step; empty if not measured."""
     final: bool = False
-    """Whether this is the end of the run, over all held-out frames."""
+    """Whether this row is the end of the run, scored over all held-out frames."""
     not_scored: NotScored = field(default_factory=dict)
-    """What has no score, and why."""
+    """Missing scores with their reasons."""
     protocol: str = ""
-    """How frames, or events where there are none, are scored: a name of `enerf_ns.evaluation.protocols`."""
+    """Name of the protocol in `enerf_ns.evaluation.protocols`."""
 
 
 def append_row(folder: Path, row: HistoryRow) -> None:
-    """Adds a row to the history of the run in a folder, whole or not at all; numbers that are not finite are left out.
+    """Appends a row to the history in the folder of a run, whole or not at all, without numbers that are not finite.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     write_together(folder, {}, {HISTORY_FILE: json.dumps(asdict(_finite(row))) + "\n"})
 
 
 def read_history(folder: Path) -> list[HistoryRow]:
-    """The rows of the run in a folder, oldest first; none where it has no history. The first line that is no row, such
-    as one that is still being written, or that a full disk or a kill cut short, is left out, as are those after it.
+    """The rows in the folder of a run, oldest first; empty if there is no history.
+
+    The first line that is no row, and all lines after it, are left out. Such a line is still being written, or was cut
+    short by a full disk or a kill.
 
     Raises:
         OSError: The file cannot be read.
@@ -67,16 +69,16 @@ def read_history(folder: Path) -> list[HistoryRow]:
     for line in lines:
         try:
             rows.append(_finite(HistoryRow(**json.loads(line))))
-        except (ValueError, TypeError, AttributeError):  # no text or no JSON, or another thing than a row
+        except (ValueError, TypeError, AttributeError):  # not text, not JSON, or not a row
             break
     return rows
 
 
 def _finite(row: HistoryRow) -> HistoryRow:
-    """The row without what is no finite number.
+    """The row without values that are not finite numbers.
 
     Raises:
-        ValueError: Its step or its time is none.
+        ValueError: The step is not an integer, or the time is not a finite number.
     """
 
     def is_number(value: object) -> bool:
@@ -92,7 +94,10 @@ def _finite(row: HistoryRow) -> HistoryRow:
 
 
 def cut_history(folder: Path, step: int) -> list[HistoryRow]:
-    """Removes the rows after a step, from which a run goes on, and the mark of an end; returns those that stay.
+    """Removes the rows after a step, and the row of the end, before a run continues from that step.
+
+    Returns:
+        The remaining rows.
 
     Raises:
         OSError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""LPIPS with AlexNet or VGG (Zhang et al., CVPR 2018), whose weights are loaded when first needed."""
+"""LPIPS with AlexNet or VGG (Zhang et al., CVPR 2018). Weights are loaded on first use."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 Net = Literal["alex", "vgg"]
-"""Networks whose features are compared: AlexNet, or VGG-16."""
+"""Network whose features are compared: AlexNet or VGG-16."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """What is known of a network."""
+    """Properties of a network for LPIPS."""
 
     model: str
-    """Name of torchvision's function that makes it."""
+    """Name of the function of torchvision that makes the network."""
     weights_variable: str
-    """Environment variable that names a file with the state dict of the model's features (ImageNet)."""
+    """Environment variable with the path of the state dict of the network's features, trained on ImageNet."""
     smallest_side: int
-    """Pixels along a side of the smallest picture of which its poolings leave anything."""
+    """Least width and height of a picture in pixels. The poolings of the network leave nothing of a smaller one."""
     score: str
     """Name of the score."""
 
@@ -43,12 +43,12 @@ NETWORKS: dict[Net, Network] = {
     "alex": Network("alexnet", "ENERF_LPIPS_WEIGHTS", 31, "lpips"),
     "vgg": Network("vgg16", "ENERF_LPIPS_VGG_WEIGHTS", 16, "lpips_vgg"),
 }
-"""By the names that LPIPS has for them."""
+"""Networks by their names in LPIPS."""
 
 
 @functools.cache
 def load_lpips(net: Net) -> LearnedPerceptualImagePatchSimilarity | None:
-    """The metric, or None with a line that says why, where its weights are neither at hand nor to be downloaded."""
+    """The metric of a network. If its weights cannot be loaded, None, and a line with the reason is printed."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     network = NETWORKS[net]
@@ -67,7 +67,7 @@ def load_lpips(net: Net) -> LearnedPerceptualImagePatchSimilarity | None:
 
 @contextmanager
 def _at_hand(network: Network, features: Path) -> Iterator[None]:
-    """Lets torchvision find a network in its folder of downloads: these features; its classifier, unused, is zeros."""
+    """Makes torchvision load these features instead of a download. The unused classifier is filled with zeros."""
     from torchvision.models import get_model, get_model_weights
 
     published: Any = get_model_weights(network.model)
@@ -77,7 +77,7 @@ def _at_hand(network: Network, features: Path) -> Iterator[None]:
     state = {
         name: weights[name.removeprefix("features.")]
         if name.startswith("features.")
-        else torch.zeros(()).expand(layer.shape)  # of which the file holds one number
+        else torch.zeros(()).expand(layer.shape)  # stored as one number
         for name, layer in layers.items()
     }
     hub = torch.hub.get_dir()
@@ -95,7 +95,7 @@ def _at_hand(network: Network, features: Path) -> Iterator[None]:
 def lpips(
     rendered: Float[Tensor, "height width 3"], recorded: Float[Tensor, "height width 3"], net: Net = "alex"
 ) -> Score:
-    """Perceptual distance of two pictures in [0, 1]."""
+    """Perceptual distance of two pictures in [0, 1], or the reason why there is none."""
     if not rendered.isfinite().all():
         return NOT_FINITE
     side = NETWORKS[net].smallest_side

@@ -1,4 +1,4 @@
-"""Scores of rendered against recorded pictures, or why there are none."""
+"""Scores of rendered against recorded pictures and events."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Score = float | str
-"""A score, or why there is none; a clause about one picture."""
+"""A score, or the reason why it is missing, as a clause about one picture."""
 
 NOT_FINITE = "the render is not finite"
 
 SSIM_SIDE = 11
-"""Pixels along each side of the window of SSIM."""
+"""Width and height of the window of SSIM, pixels."""
 
 
 def psnr(rendered: Float[Tensor, "*shape"], recorded: Float[Tensor, "*shape"]) -> Score:
@@ -37,12 +37,12 @@ def ssim(rendered: Float[Tensor, "height width channels"], recorded: Float[Tenso
 
 
 def correlation(rendered: Float[Tensor, "*shape"], recorded: Float[Tensor, "*shape"]) -> Score:
-    """Linear (Pearson) correlation of two pictures, blind to scale and offset of brightness."""
+    """Linear (Pearson) correlation of two pictures, which does not depend on scale and offset of brightness."""
     if not rendered.isfinite().all():
         return NOT_FINITE
     for what, values in (("rendered", rendered), ("recorded", recorded)):
         if values.min() == values.max():
-            return f"what is {what} is flat"
+            return f"the {what} values are all equal"
     pixels = torch.stack([rendered.flatten(), recorded.flatten()]).double()
     return float(torch.corrcoef(pixels)[0, 1])
 
@@ -54,16 +54,16 @@ EVENT_SCORES = ("event_correlation", "event_rmse", "event_sign")
 def event_scores(
     predicted: Float[Tensor, " pairs"], measured: Float[Tensor, " pairs"], mean_threshold: float
 ) -> dict[str, Score]:
-    """How well rendered changes of log brightness agree with what pairs of events measured: the protocol "events".
+    """Agreement of rendered changes of log brightness with those that pairs of events measured (protocol "events").
 
     Args:
         predicted: Rendered change of log brightness of each pair.
-        measured: The change that the events of each pair add up to.
+        measured: Sum of the changes of the events of each pair.
         mean_threshold: Mean contrast threshold, the unit of the error.
 
     Returns:
-        event_correlation (linear), event_rmse (root mean square error, thresholds), and event_sign (share of the pairs,
-        of those whose events do not cancel, whose rendered change has the sign of the measured one).
+        event_correlation (linear), event_rmse (root mean square error in thresholds), and event_sign. event_sign is the
+        share of pairs whose rendered change has the sign of the measured one, without pairs whose events cancel.
     """
     scores: dict[str, Score] = {"event_correlation": correlation(predicted, measured)}
     if not predicted.isfinite().all():
@@ -77,11 +77,11 @@ def event_scores(
 
 
 KNOWN = 0.5
-"""Confidence from which rendered depth counts as known."""
+"""Least confidence of rendered depth that counts as known."""
 
 
 def depth_rmse(rendered: Float[Tensor, "height width 1"], recorded: Float[Tensor, "height width 1"]) -> Score:
-    """Root mean squared error of depth in metres, over the pixels whose recorded depth is known."""
+    """Root mean square error of depth in metres, over the pixels with known recorded depth."""
     known = is_known(recorded)
     if not known.any():
         return "no depth is known"
@@ -91,5 +91,5 @@ def depth_rmse(rendered: Float[Tensor, "height width 1"], recorded: Float[Tensor
 
 
 def is_known(depth: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    """Which recorded depths are known: those that are positive and finite."""
+    """Whether recorded depths are known, that is, positive and finite."""
     return (depth > 0.0) & depth.isfinite()

@@ -1,4 +1,4 @@
-"""Named protocols: what is done to the brightness of renders before they are compared with frames, and how."""
+"""Named protocols of scoring: how the brightness of renders is corrected before they are compared with frames."""
 
 from __future__ import annotations
 
@@ -15,67 +15,68 @@ from torch import Tensor
 from enerf_ns.sensor.response import inverse_linlog, linlog
 
 FLAT = 1e-12
-"""Variance of log brightness up to which nothing can be fitted to pictures."""
+"""Variance of log brightness up to which a picture is flat, so that no correction can be fitted."""
 
 DARKEST = 1e-4
-"""Brightness up to which the power of gamma-affine takes everything as equally dark."""
+"""Brightness to which the protocol gamma-affine raises all darker values."""
 
 GAMMA, EVENTNERF_OFFSET = 2.2, 0.1
-"""Gamma of pictures, and what is added to linear brightness before its logarithm, in EventNeRF's evaluation."""
+"""Gamma of pictures, and offset of linear brightness before its logarithm, in EventNeRF's evaluation."""
 
 COLOURS = ("_red", "_green", "_blue")
-"""What follows the names of the parameters of each channel that is fitted by itself."""
+"""Suffixes of the parameters of channels that are fitted separately."""
 
 Pixels = Float64[Tensor, "pixels channels"]
-"""Brightness of many pixels, a column for each channel that is fitted by itself."""
+"""Brightness of pixels, with a column for each channel that is fitted separately."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A correction of brightness, fitted to pictures."""
+    """A correction of brightness that was fitted to pictures."""
 
     parameters: dict[str, Tensor]
-    """By name, one number, or one for each channel that was fitted by itself."""
+    """Parameters by name: one number, or one for each separately fitted channel."""
     apply: Callable[[Tensor], Tensor]
-    """From linear brightness (..., channels) to linear brightness."""
+    """Map of linear brightness (..., channels) to linear brightness."""
 
 
 Fit = Callable[[Pixels, Pixels], "Correction | str"]
-"""Fits a correction of what was rendered to what was recorded; or a clause that says why there is none."""
+"""Fits a correction of rendered to recorded brightness. Returns it, or the reason why there is none, as a clause."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a set of renders is compared with recorded frames; both are linear brightness, frames in [0, 1]."""
+    """Comparison of renders with frames. Both hold linear brightness, frames in [0, 1]."""
 
     description: str
-    """One sentence for whoever reads the scores."""
+    """Sentences for readers of the scores."""
     fit: Fit | None = None
-    """The correction of brightness; None: renders are compared as they are."""
+    """Fit of the correction of brightness. None: renders are not corrected."""
     each_picture: bool = False
-    """Whether each picture has a fit of its own; otherwise there is one over the set."""
+    """Whether each picture has its own fit. Otherwise, one fit is over all pictures."""
     each_channel: bool = False
-    """Whether channels are always fitted by themselves; otherwise they are where the sensor has a colour filter, since
-    events then leave the log brightness of each open."""
+    """Whether channels are always fitted separately. Otherwise, they are only if the sensor has a colour filter,
+    because events then do not determine the offsets between channels."""
     encode: Callable[[Tensor], Tensor] = field(default=lambda brightness: brightness)
-    """From linear brightness to that in which pictures are compared."""
+    """Map of linear brightness to the values that are compared."""
     clips: bool = True
-    """Whether PSNR is of renders clipped to [0, 1]; SSIM and LPIPS always are."""
+    """Whether renders are clipped to [0, 1] for PSNR. For SSIM and LPIPS they always are."""
     pooled: bool = False
-    """Whether PSNR is of the mean squared error over all pixels of all pictures, not the mean of each picture's."""
+    """Whether PSNR is that of the mean squared error over all pictures, instead of the mean PSNR of pictures."""
 
 
 @dataclass(frozen=True)
 class Aligned:
-    """A set of pictures as a protocol compares them."""
+    """Pictures after the correction of a protocol."""
 
     rendered: list[Tensor]
-    """Corrected where there is a fit, and not clipped."""
+    """Renders, corrected if there is a fit, and not clipped."""
     recorded: list[Tensor]
+    """Frames."""
     faults: list[str | None]
-    """Of each picture, why there is no fit; None where there is one, or need not be."""
+    """Reason why a picture has no fit; None if it has one or the protocol needs none."""
     parameters: dict[str, float]
-    """Of the one fit over the set, by name; of a channel by itself, NAME_red and so on."""
+    """Parameters of the fit over all pictures by name; NAME_red, NAME_green and NAME_blue for separate channels."""
 
 
 def align(
@@ -84,9 +85,9 @@ def align(
     protocol: str,
     colour_filter: bool = False,
 ) -> Aligned:
-    """Fits brightness as a protocol says, in float64, and applies the fit.
+    """Fits and applies the correction of brightness of a protocol, in float64.
 
-    Renders that are not finite are left out of the fit, and stay as they are.
+    Renders that are not finite are left out of the fit and not corrected.
 
     Args:
         rendered: Linear brightness, 0 or more.
@@ -123,10 +124,13 @@ def align(
 
 
 def _fault(x: Pixels, y: Pixels) -> str | None:
-    """Why nothing can be fitted to log brightness, where one channel is flat."""
+    """The reason why nothing can be fitted to log brightness, if a channel is flat; otherwise None."""
     variances = [torch.mean((values - values.mean(dim=0)) ** 2, dim=0) for values in (x, y)]
     if float(torch.cat(variances).min()) <= FLAT:
-        return "no brightness fits, since what is rendered or recorded is flat; check that the field has learnt"
+        return (
+            "no correction of brightness can be fitted, since the render or the frame is flat; check that the field "
+            "has learnt"
+        )
     return None
 
 
@@ -138,7 +142,7 @@ def _negative(scale: float) -> str:
 
 
 def _line(x: Pixels, y: Pixels) -> tuple[Tensor, Tensor] | str:
-    """Scale and offset of the line through each column, by ordinary least squares; or why there is none."""
+    """Scale and offset of the line through each column by ordinary least squares, or the reason why there is none."""
     fault = _fault(x, y)
     if fault is not None:
         return fault
@@ -184,9 +188,10 @@ def _gamma_encoded(brightness: Tensor) -> Tensor:
 
 
 def _gamma_affine(x: Pixels, y: Pixels) -> Correction | str:
-    """y = a * x^b + c by Levenberg-Marquardt, a and c of each column, b of all; from the least squares of logarithms.
+    """Fits y = a * x^b + c by Levenberg-Marquardt, with a and c for each column and one b.
 
-    x is divided by its geometric mean meanwhile, so that a and b hardly depend on each other.
+    The fit starts from the least squares solution for logarithms. x is divided by its geometric mean during the fit, so
+    that a and b are almost independent.
     """
     logarithms, of_target = torch.log(x.clamp(min=DARKEST)), torch.log(y.clamp(min=DARKEST))
     if fault := _fault(logarithms, of_target):
@@ -225,28 +230,28 @@ def _gamma_affine(x: Pixels, y: Pixels) -> Correction | str:
 
 PROTOCOLS: dict[str, Protocol] = {
     "log-affine-set": Protocol(
-        "One scale and offset of log brightness (linlog) is fitted over all held-out frames, of each colour channel by "
-        "itself where the sensor has a colour filter; renders are clipped to [0, 1], PSNR is the mean over frames.",
+        "One scale and offset of log brightness (linlog) is fitted over all held-out frames, separately for each "
+        "colour channel if the sensor has a colour filter. Renders are clipped to [0, 1]. PSNR is the mean over "
+        "frames.",
         _log_affine,
     ),
     "log-affine-image": Protocol(
-        "One scale and offset of log brightness (linlog) is fitted to each held-out frame by itself, of each colour "
-        "channel by itself where the sensor has a colour filter; renders are clipped to [0, 1], PSNR is the mean over "
-        "frames.",
+        "A scale and offset of log brightness (linlog) is fitted to each held-out frame, separately for each colour "
+        "channel if the sensor has a colour filter. Renders are clipped to [0, 1]. PSNR is the mean over frames.",
         _log_affine,
         each_picture=True,
     ),
     "log-offset": Protocol(
-        "One offset of log brightness (linlog), whose scale stays 1, is fitted over all held-out frames, of each "
-        "colour channel by itself where the sensor has a colour filter, as E-3DGS does; renders are clipped to [0, 1], "
-        "PSNR is the mean over frames.",
+        "One offset of log brightness (linlog) is fitted over all held-out frames, separately for each colour channel "
+        "if the sensor has a colour filter, and the scale stays 1, as in E-3DGS. Renders are clipped to [0, 1]. PSNR "
+        "is the mean over frames.",
         _log_offset,
     ),
     "eventnerf": Protocol(
-        "One scale and offset of log(brightness + 0.1) is fitted over all held-out frames, of each colour channel by "
-        "itself, as EventNeRF does: linear brightness of renders and frames stands for its png^2.2, pictures are "
-        "compared after max(0, brightness)^(1/2.2), and PSNR is of the mean squared error over all pixels of all "
-        "frames, before clipping.",
+        "One scale and offset of log(brightness + 0.1) is fitted over all held-out frames, separately for each colour "
+        "channel, as in EventNeRF. Linear brightness of renders and frames replaces its png^2.2. Pictures are compared "
+        "after max(0, brightness)^(1/2.2). PSNR is that of the mean squared error over all pixels of all frames, "
+        "before clipping.",
         _eventnerf,
         each_channel=True,
         encode=_gamma_encoded,
@@ -254,35 +259,34 @@ PROTOCOLS: dict[str, Protocol] = {
         pooled=True,
     ),
     "gamma-affine": Protocol(
-        "Brightness is corrected to a * brightness^b + c, fitted to linear brightness over all held-out frames by "
-        "Levenberg-Marquardt, b shared and a and c of each colour channel where the sensor has a colour filter, as "
-        "Deblur e-NeRF does, with exposures and gains taken as equal; PSNR is the mean over frames, before clipping.",
+        "The correction a * brightness^b + c is fitted to linear brightness over all held-out frames by "
+        "Levenberg-Marquardt, as in Deblur e-NeRF with equal exposures and gains. If the sensor has a colour filter, "
+        "each colour channel has its own a and c. PSNR is the mean over frames, before clipping.",
         _gamma_affine,
         clips=False,
     ),
     "raw": Protocol(
-        "Renders are compared as they are, without alignment of brightness; they are clipped to [0, 1], PSNR is the "
-        "mean over frames."
+        "The brightness of renders is not corrected. Renders are clipped to [0, 1]. PSNR is the mean over frames."
     ),
 }
 """Protocols by name."""
 
 DEFAULT_PROTOCOL = "log-affine-set"
-"""Name of the protocol of every run, whatever it learnt from, so that scores can be compared."""
+"""Name of the protocol of every run, whatever its training data, so that scores of runs are comparable."""
 
 EVENTS_PROTOCOL = "events"
-"""Name of the protocol of recordings without frames, whose scores are the `event_scores`."""
+"""Name of the protocol for recordings without frames. Its scores are the `event_scores`."""
 
 
 def described(protocol: str) -> str:
-    """A sentence that says how scores were made.
+    """Sentences that describe a protocol.
 
     Args:
         protocol: Name of one of `PROTOCOLS`, or `EVENTS_PROTOCOL`.
     """
     if protocol == EVENTS_PROTOCOL:
         return (
-            "Protocol events: there are no frames; rendered changes of log brightness are compared with those that "
-            "pairs of events measured, as they are."
+            "Protocol events: there are no frames. Rendered changes of log brightness are compared with those that "
+            "pairs of held-out events measured, without correction."
         )
     return f"Protocol {protocol}: {PROTOCOLS[protocol].description}"

@@ -1,4 +1,4 @@
-"""Scores of held-out views: of each, their mean, and all that is known of a run in numbers."""
+"""Scores of held-out views: of each view, their means, and the summary of a run."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, PRO
 from enerf_ns.evaluation.views import EXPECTED_SCALE, HeldOutView, aligned_views
 
 NotScored = dict[str, dict[str, list[int]]]
-"""What has no value: by score and reason, the numbers of the held-out frames, from 0; none of a score of the whole
-set."""
+"""Numbers of the held-out frames without a value, from 0, by score and reason. The list is empty for a score of the
+whole set."""
 
 
 def view_scores(
     view: HeldOutView, aligned: HeldOutView, protocol: str = DEFAULT_PROTOCOL, lpips_nets: Sequence[Net] = ("alex",)
 ) -> dict[str, Score]:
-    """Scores of one held-out frame, each a number or why there is none.
+    """Scores of one held-out frame. Each is a number, or the reason why it is missing.
 
     Args:
-        view: As it was rendered.
-        aligned: The same among `aligned_views`.
-        protocol: Which of `PROTOCOLS` aligned it.
-        lpips_nets: Networks whose LPIPS is computed.
+        view: View before the correction of brightness.
+        aligned: The same view in `aligned_views`.
+        protocol: Name of the protocol in `PROTOCOLS` that corrected it.
+        lpips_nets: Networks of LPIPS.
 
     Returns:
-        psnr (dB), ssim, correlation, lpips (AlexNet) and lpips_vgg, those that are asked for, and of a recording with
-        depth depth_rmse (metres); where the view says how far its depth is known, also depth_known, the share of pixels
-        whose depth is, depth_rmse_known over these, and depth_rmse_spread of the spread depth over all (metres). The
-        correlation is that of the render as it is, before brightness is aligned.
+        psnr (dB), ssim, correlation, the requested ones of lpips (AlexNet) and lpips_vgg, and, if the recording has
+        depth, depth_rmse (metres). If the view has a confidence of its depth, also depth_known, the share of pixels
+        with known depth; depth_rmse_known over these pixels (metres); and depth_rmse_spread of the spread depth over
+        all pixels (metres). The correlation is that of the render before the correction of brightness.
     """
     names = ["psnr", "ssim", *(NETWORKS[net].score for net in lpips_nets)]
     if view.recorded is None or aligned.recorded is None:
@@ -66,17 +66,17 @@ def mean_scores(
     lpips_nets: Sequence[Net] = ("alex",),
     crop: tuple[int, int] | None = None,
 ) -> tuple[dict[str, float], NotScored]:
-    """Mean of each of the `view_scores` over the held-out frames that have it; no entry where none has.
+    """Mean of each of the `view_scores` over the held-out frames that have it. A score that no frame has is left out.
 
     Args:
         views: At least one, of one recording, as `held_out_views` gives them.
-        with_std: Give the standard deviation over these frames too, as NAME_std.
-        protocol: Which of `PROTOCOLS` aligns brightness, and says how PSNR is computed.
-        lpips_nets: Networks whose LPIPS is computed.
-        crop: Height and width of the middle of each frame that alone is fitted and scored; None: all.
+        with_std: Whether to add the standard deviation over these frames, as NAME_std.
+        protocol: Name of the protocol in `PROTOCOLS`.
+        lpips_nets: Networks of LPIPS.
+        crop: Height and width in pixels of the central part of each frame that is fitted and scored. None: all.
 
     Returns:
-        The means, and which frames they leave out, and why.
+        The means, and the frames that they leave out, with reasons.
 
     Raises:
         FlagError: The crop is larger than the frames.
@@ -119,20 +119,19 @@ def summary_scores(
     lpips_nets: Sequence[Net] = ("alex",),
     crop: tuple[int, int] | None = None,
 ) -> dict[str, float | str | NotScored | None]:
-    """Mean scores and the numbers about the whole set in one table, with a place for each score that can be missing.
+    """Mean scores and numbers about the whole set in one dictionary, with None for scores that are missing.
 
     Args:
         views: At least one, as `held_out_views` gives them.
         summary: Numbers about the whole set, as `held_out_views` gives them.
-        with_std, protocol, lpips_nets, crop: As of `mean_scores`.
+        with_std, protocol, lpips_nets, crop: The arguments of `mean_scores`.
 
     Returns:
-        protocol, the name; psnr (dB), ssim, lpips, correlation, and with known depth depth_rmse and mean_depth
-        (metres), and what else `view_scores` has of depth; means over the held-out frames that have them; the
-        parameters of the protocol's fit over the whole set, with brightness_scale_expected only beside that of
-        log-affine-set, of which it is. psnr, ssim and what was asked of LPIPS are None where no
-        frame has them; without frames, event_correlation stands for them, and the protocol is "events". not_scored,
-        where anything is left out, says what and why.
+        The name of the protocol; means of psnr (dB), ssim, lpips, correlation, and, if depth is known, depth_rmse,
+        mean_depth (metres) and the other depth scores of `view_scores`; and the parameters of the protocol's fit over
+        the whole set. brightness_scale_expected is present only with log-affine-set. psnr, ssim and the requested LPIPS
+        are None if no frame has them. Without frames, event_correlation replaces them, and the protocol is "events".
+        not_scored, if present, holds the missing values with their reasons.
 
     Raises:
         FlagError: The crop is larger than the frames.

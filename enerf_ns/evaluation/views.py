@@ -1,4 +1,4 @@
-"""Held-out frames and what a field shows there, as pictures."""
+"""Held-out views: a frame, and the render at its pose, as pictures."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from enerf_ns.evaluation.metrics import is_known
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 
 EXPECTED_SCALE = "brightness_scale_expected"
-"""Name of what the brightness_scale of log-affine-set should be."""
+"""Name of the expected value of brightness_scale in the protocol log-affine-set."""
 
 
 @dataclass
 class HeldOutView:
-    """One held-out frame and what the field shows there. Tensors of shape (height, width, channels) on the CPU."""
+    """One held-out frame and the render at its pose. Tensors (height, width, channels) are on the CPU."""
 
     recorded: Tensor | None
-    """Frame in [0, 1], three channels; None where the recording has no frames."""
+    """Frame in [0, 1], three channels; None if the recording has no frames."""
     rendered: Tensor
-    """Render as the field has it: linear brightness, three channels; where the exposure of each frame is learned, with
-    that between the frames next to it in time."""
+    """Linear brightness that the field renders, three channels. If exposures of frames are learned, it has the exposure
+    interpolated between the neighbouring training frames."""
     depth: Tensor
     """Rendered depth in metres along the optical axis, one channel."""
     recorded_depth: Tensor | None
-    """Depth in metres along the optical axis, 0 where unknown; None where the recording has none."""
+    """Depth in metres along the optical axis, 0 where unknown; None if the recording has no depth."""
     time: int
     """Instant of the view, ns."""
     colour_filter: bool = False
-    """Whether the sensor has a colour filter, so that events leave the brightness of each channel open by itself."""
+    """Whether the sensor has a colour filter. Events then do not determine the offsets between channels."""
     not_aligned: str | None = None
-    """Of `aligned_views`, why the brightness of the render, which should be aligned, is not; None where it is."""
+    """Reason why `aligned_views` could not correct the brightness of the render; None if it could."""
     confidence: Tensor | None = None
-    """How far the rendered depth is known, from 0 to 1, one channel; None where that was not asked for."""
+    """Confidence of the rendered depth, 0 to 1, one channel; None if not computed."""
     spread_depth: Tensor | None = None
     """Rendered depth in metres along the optical axis, spread from where it is known
-    (`enerf_ns.rendering.spread_depth`), one channel; None where the confidence is."""
+    (`enerf_ns.rendering.spread_depth`), one channel; None if not computed."""
 
     def cropped(self, height: int, width: int) -> HeldOutView:
-        """The middle of the view.
+        """The central part of the view, of this height and width in pixels.
 
         Raises:
-            FlagError: It is larger than the view.
+            FlagError: The part is larger than the view.
         """
         whole = self.rendered.shape[:2]
         if not (0 < height <= whole[0] and 0 < width <= whole[1]):
@@ -70,8 +70,7 @@ class HeldOutView:
 
     @property
     def median_depth(self) -> float:
-        """Median depth in metres, of what is known of the recorded one, else of what is finite of the rendered one;
-        1 where there is neither."""
+        """Median known recorded depth in metres. If there is none, the median finite rendered depth; otherwise 1."""
         for depth in (self.recorded_depth, self.depth):
             known = None if depth is None else depth[is_known(depth)]
             if known is not None and len(known):
@@ -82,7 +81,7 @@ class HeldOutView:
 def aligned_views(
     views: Sequence[HeldOutView], protocol: str = DEFAULT_PROTOCOL
 ) -> tuple[list[HeldOutView], dict[str, float]]:
-    """The views as a protocol compares them, to be shown; those without frames as they are.
+    """Views whose brightness a protocol has corrected. Views without frames stay unchanged.
 
     Args:
         views: As `held_out_views` gives them.
@@ -102,7 +101,7 @@ def aligned_views(
 
 
 def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
-    """Write one picture a view, eval_img_0000.png and so on: the frame, where there is one, beside the render.
+    """Writes a picture of each view, eval_img_0000.png and so on: the frame, if there is one, beside the render.
 
     Args:
         views: In the order of their numbers, as `aligned_views` gives them.
@@ -122,7 +121,7 @@ def save_pictures(views: Sequence[HeldOutView], folder: Path) -> None:
 
 
 def png(picture: Float[Tensor, "height width 3"]) -> bytes:
-    """A picture in [0, 1] as a PNG file; what is not finite is black or white."""
+    """A picture in [0, 1] as a PNG file. Values that are not finite become black or white."""
     content = io.BytesIO()
     pixels = (255.0 * picture.nan_to_num().clamp(0.0, 1.0).cpu().numpy()).round().astype(np.uint8)
     Image.fromarray(pixels).save(content, format="png")

@@ -1,9 +1,9 @@
-"""How well a surface fits a reference, in metres, over what cameras saw of it."""
+"""Distances in metres between a surface and the part of a reference that cameras saw."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.simulator.view import scene_of
 
 NEAR = 0.05
-"""Distance in metres within which a surface counts as right."""
+"""Distance in metres up to which a surface counts as correct."""
 
 SAMPLES = 100_000
-"""Points, at most, whose distances are measured in each direction."""
+"""Most points whose distances are measured in each direction."""
 
 
 @dataclass(frozen=True)
@@ -34,27 +34,25 @@ class SurfaceScores:
     accuracy: float
     """Mean distance from the surface to the reference."""
     completeness: float
-    """Mean distance from the reference, as far as some camera saw it, to the surface."""
+    """Mean distance from the seen part of the reference to the surface."""
     chamfer: float
-    """Mean of both."""
+    """Mean of accuracy and completeness."""
     accurate_share: float
     """Share of the surface within `NEAR` of the reference."""
     complete_share: float
-    """Share of the reference, as far as some camera saw it, within `NEAR` of the surface."""
-
-    def as_dict(self) -> dict[str, float]:
-        return asdict(self)
+    """Share of the seen part of the reference within `NEAR` of the surface."""
 
     def __str__(self) -> str:
+        """The scores in one sentence."""
         return (
             f"accuracy {self.accuracy:.4f} m, completeness {self.completeness:.4f} m, Chamfer {self.chamfer:.4f} m; "
-            f"within {NEAR:g} m: {self.accurate_share:.1%} of the surface, {self.complete_share:.1%} of what was seen "
-            "of the reference"
+            f"within {NEAR:g} m: {self.accurate_share:.1%} of the surface, {self.complete_share:.1%} of the seen "
+            "part of the reference"
         )
 
 
 def simulated_scene(recording: Path) -> Scene | None:
-    """The scene that a recording was simulated of; None where it was not, or not of a scene."""
+    """The scene of a simulated recording; None if the recording was not simulated from a scene."""
     file = recording / "simulation.json"
     about = read_json(file) if file.is_file() else {}
     if not about.get("scene"):
@@ -72,10 +70,10 @@ def surface_scores(
     """Compares a surface with a scene.
 
     Args:
-        surface: In metres, in the axes of the scene; not empty.
+        surface: Mesh or points in metres, in the axes of the scene; not empty.
         scene: The reference.
-        camera: That saw the scene, without distortion.
-        poses: That it had; camera to world, OpenCV axes, metres.
+        camera: Camera without distortion that saw the scene.
+        poses: Its poses, camera to world in OpenCV axes, metres.
     """
     generator = np.random.default_rng(0)
     reference = trimesh.Trimesh(scene.triangles.reshape(-1, 3), np.arange(3 * len(scene.triangles)).reshape(-1, 3))
@@ -98,7 +96,7 @@ def surface_scores(
 def seen_points(
     scene: Scene, camera: Camera, poses: Sequence[Float64[np.ndarray, "3 4"]]
 ) -> Float64[np.ndarray, "points 3"]:
-    """What cameras see of a scene: the points that their pixels show, one for each centimetre, metres."""
+    """Points of a scene that pixels of the camera show, in metres; one point for each cubic centimetre."""
     renderer, directions = Renderer(scene, camera), camera.pixel_directions()
     points = []
     for pose in poses:

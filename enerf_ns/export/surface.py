@@ -1,4 +1,4 @@
-"""Surfaces of a trained run in metres, in the axes of the recording: from depth that is known, seen along the path."""
+"""Surfaces of a trained run, in metres and in the axes of the recording, fused from rendered depth."""
 
 from __future__ import annotations
 
@@ -20,48 +20,48 @@ from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.rendering.spread_depth import depth_evidence
 
 NUM_VIEWS = 40
-"""Views, spread evenly over the trajectory, that are fused."""
+"""Number of views that are fused, spread evenly over the trajectory."""
 
 SURE = 0.3
-"""Confidence from which depth is fused; less than for scores, since views are averaged. From 0.5 to 0.05 the surface
-has more of what was seen, and more that is wrong; the Chamfer distance is least at 0.15 to 0.3."""
+"""Confidence from which depth is fused. It is lower than for scores, because views are averaged. Between 0.5 and 0.05,
+a lower value makes the surface more complete and less accurate. The Chamfer distance is least at 0.15 to 0.3."""
 
 TRUNCATION = 4.0
-"""Distance from a surface within which it is averaged, in voxels."""
+"""Truncation distance of the signed distance function, in voxels."""
 
 BLOCK, NUM_BLOCKS = 16, 10_000
-"""Voxels along the side of a block of them, and blocks that there is room for at first."""
+"""Voxels along each side of a block, and number of blocks with memory at first."""
 
 FEWEST_VIEWS = 2.0
-"""Views that must show a place for it to be surface."""
+"""Number of views that must show a place for it to be surface."""
 
 WHITE = 0.99
-"""Share of the brightness that is not white in the colours."""
+"""Quantile of brightness that is white in the colours."""
 
 GAMMA = 2.2
-"""Of the display that colours are for: they are brightness to the power of its inverse."""
+"""Gamma of the display: colours are brightness^(1 / GAMMA)."""
 
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """What one pose of the trajectory shows."""
+    """The render at one pose of the trajectory."""
 
     pose: Float64[np.ndarray, "3 4"]
     """Camera to world, OpenCV axes, metres."""
     depth: Float32[np.ndarray, "height width"]
     """Spread depth along the optical axis, metres."""
     known: Bool[np.ndarray, "height width"]
-    """Whether the depth is known well enough."""
+    """Whether the confidence of the depth is at least `SURE`."""
     brightness: Float32[np.ndarray, "height width 3"]
-    """Linear, 0 or more."""
+    """Linear brightness, 0 or more."""
 
 
 @torch.no_grad()
 def surface_views(pipeline: EnerfPipeline, number: int = NUM_VIEWS) -> tuple[Camera, list[SurfaceView]]:
-    """What poses spread evenly over the trajectory show, by the camera of the events without its distortion.
+    """Renders views at poses spread evenly over the trajectory.
 
     Returns:
-        That camera, and the views.
+        The event camera without distortion, and its views.
     """
     pipeline.eval()
     manager, model = pipeline.datamanager, pipeline.model
@@ -84,33 +84,33 @@ def surface_views(pipeline: EnerfPipeline, number: int = NUM_VIEWS) -> tuple[Cam
 
 
 def colours_of(views: Sequence[SurfaceView]) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """The brightness of views as a display shows it; `WHITE` of it is darker than white."""
+    """The brightness of views as colours for a display; the quantile `WHITE` of it becomes white."""
     white = max(float(np.quantile(np.stack([view.brightness for view in views]), WHITE)), 1e-6)
     shown = [(view.brightness / white).clip(0.0, 1.0) ** (1.0 / GAMMA) for view in views]
     return [np.ascontiguousarray((255.0 * picture).round().astype(np.uint8)) for picture in shown]
 
 
 def pixel_size(camera: Camera, views: Sequence[SurfaceView]) -> float:
-    """Size of a pixel on the median of what is known, metres.
+    """Size of a pixel at the median known depth, metres.
 
     Raises:
-        RecordingError: Nothing is known.
+        RecordingError: No depth is known.
     """
     known = np.concatenate([view.depth[view.known] for view in views])
     if not len(known):
-        raise RecordingError("The run knows no depth anywhere, so that there is no surface; train it longer.")
+        raise RecordingError("The run knows no depth anywhere, so there is no surface; train it longer.")
     return float(np.median(known)) / camera.fx
 
 
 def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh.Trimesh:
-    """The surface that views show, where their depth is known; what none shows stays empty.
+    """The surface that views show where their depth is known. Unseen regions stay empty.
 
     A truncated signed distance function (B. Curless, M. Levoy, "A volumetric method for building complex models from
     range images", SIGGRAPH 1996), by Open3D.
 
     Args:
-        camera: Without distortion.
-        views: That it had.
+        camera: Camera without distortion.
+        views: Its views.
         voxel: Side of a voxel, metres.
 
     Returns:
@@ -143,11 +143,11 @@ def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh
 
 
 def points_of(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh.PointCloud:
-    """The points that views show, where their depth is known: of those within a voxel, their mean, with its colour.
+    """The points that views show where their depth is known, averaged with their colours within each voxel.
 
     Args:
-        camera: Without distortion.
-        views: That it had.
+        camera: Camera without distortion.
+        views: Its views.
         voxel: Side of a voxel, metres.
     """
     directions = camera.pixel_directions()

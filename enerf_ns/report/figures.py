@@ -1,4 +1,4 @@
-"""Plots of runs: error against time, work and precision, and what a step spends its time on."""
+"""Plots of runs: error against time, final error against time, and the time of a step by part."""
 
 from __future__ import annotations
 
@@ -23,46 +23,46 @@ SCORES = {
     "correlation": "correlation",
     "depth_rmse": "depth RMSE, m",
     "depth_rmse_known": "depth RMSE where known, m",
-    "depth_known": "depth known, share",
+    "depth_known": "known depth, share",
     "depth_rmse_spread": "depth RMSE, spread, m",
     "event_correlation": "event correlation",
     "event_rmse": "event RMSE, thresholds",
     "event_sign": "event sign, share",
 }
-"""What is said of each score on an axis, with its unit."""
+"""Label of each score with its unit."""
 
 AT_END = ("depth_rmse_known", "depth_known", "depth_rmse_spread")
-"""Those that only the end of a run has."""
+"""Scores that exist only at the end of a run."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which the colour-blind tell apart."""
+"""Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 GREY = "#5a6272"
 MARKERS = "osD^vPX<>"
 LINES = ("-", "--", "-.", ":")
 FINAL = {"linestyle": "none", "markersize": 11, "markeredgecolor": "black"}
-"""How the score over all held-out frames looks."""
+"""Style of the score over all held-out frames."""
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "+++", "ooo")
 
 WIDTH = 5.6
-"""Width of a plot, inches: text of 9 points can be read on a phone's screen."""
+"""Width of a plot in inches, at which text of 9 points is readable on a phone."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """What the plots show of a run."""
+    """The data of a run that the plots show."""
 
     name: str
     history: list[HistoryRow]
     seconds: float | None
-    """Training time of the scores; None where it is not known."""
+    """Training time up to the scored step, s; None if unknown."""
     scores: dict[str, float]
-    """The run's scores, as in the table."""
+    """Scores of the run, as in the table."""
     over_all_frames: bool
     """Whether the scores are over all held-out frames."""
 
 
 def style(number: int) -> dict[str, Any]:
-    """Colour, marker and line of a run, which differ each by itself."""
+    """Colour, marker and line of the run with this number. Each alone distinguishes the first seven runs or more."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "marker": MARKERS[number % len(MARKERS)],
@@ -70,11 +70,17 @@ def style(number: int) -> dict[str, Any]:
     }
 
 
-def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) -> Figure | None:
-    """Each score that any run has against training time or steps, on a logarithmic axis; None where no run has any.
-    Where any run has frames, the correlation stands for all scores of events.
+def plain(axis: Axes) -> None:
+    """Gives a plot a light grid, and no frame above and on the right."""
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
 
-    Scores over a few frames are joined by a line; those over all frames, at the end of a run, are larger, and apart.
+
+def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) -> Figure | None:
+    """Plots of each score against training time or steps, on a logarithmic axis; None if no run has scores.
+
+    If any run has frames, event_correlation alone represents the scores of events. A line joins the scores over a few
+    frames during training. Larger, separate marks show the scores over all frames at the end of a run.
     """
     from matplotlib.figure import Figure
 
@@ -93,23 +99,21 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
                 look = style(number) | (FINAL if final else {"markersize": 4})
                 axis.plot([getattr(row, axis_of) for row in chosen], [row.scores[name] for row in chosen], **look)
         axis.set_ylabel(SCORES[name])
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
     _logarithmic(axes[-1], "x", [getattr(row, axis_of) for row in drawn])
     axes[-1].set_xlabel("training time, s (log)" if axis_of == "seconds" else "training steps (log)")
     few = {row.num_frames for row in drawn if not row.final and row.num_frames}
     over = f"{min(few)} held-out frames" if len(few) == 1 else "a few held-out frames"
-    marks = [("o", GREY, 4, "full", f"small, joined: over {over}, while training")]
-    marks += [("o", GREY, 9, "full", "large, apart: at the end, over all held-out frames")]
+    marks = [("o", GREY, 4, "full", f"small, joined: {over}, during training")]
+    marks += [("o", GREY, 9, "full", "large: all held-out frames, at the end")]
     _legend(axes[0], runs, marks if any(row.final for row in drawn) else marks[:1])
     return figure
 
 
 def work_precision(runs: Sequence[Curve]) -> Figure | None:
-    """Error against training time, one point a run, with the Pareto front; None where fewer than two runs have both.
+    """Plots of the final error against training time with the Pareto front; None if fewer than two runs have both.
 
-    Of PSNR the error is the RMS error of brightness, 10^(-PSNR / 20); of depth its RMSE; of events what their
-    correlation lacks of 1.
+    The errors are the RMS error of brightness, 10^(-PSNR / 20), the RMSE of depth in metres, and 1 - event_correlation.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
@@ -137,9 +141,8 @@ def work_precision(runs: Sequence[Curve]) -> Figure | None:
         axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1)
         axis.plot(*zip(*front, strict=True), "o", markersize=17, fillstyle="none", color=GREY, zorder=2)
         axis.set_ylabel(f"{label} (log)")
-        axis.grid(alpha=0.3)
         axis.margins(0.12)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
         _logarithmic(axis, "y", [cost[1] for cost in costs])
         if name == "psnr":
             decibels = axis.secondary_yaxis("right", functions=(psnr_of, rms_error))
@@ -149,28 +152,28 @@ def work_precision(runs: Sequence[Curve]) -> Figure | None:
             decibels.yaxis.set_minor_locator(NullLocator())
     _logarithmic(axes[-1], "x", [run.seconds for run in runs if run.seconds])
     axes[-1].set_xlabel("training time, s (log)")
-    marks = [("o", GREY, 12, "none", "on the Pareto front: no other run is as fast and as good")]
+    marks = [("o", GREY, 12, "none", "on the Pareto front: no other run is both faster and better")]
     if not all(run.over_all_frames for run in runs):
-        marks.append(("o", GREY, 6, "none", "hollow: over a few held-out frames, while training"))
+        marks.append(("o", GREY, 6, "none", "hollow: a few held-out frames, during training"))
     _legend(axes[0], runs, marks)
     return figure
 
 
 def rms_error(psnr: float) -> float:
-    """RMS error of brightness in [0, 1], of a PSNR in dB; of arrays too."""
+    """RMS error of brightness in [0, 1] for a PSNR in dB, or for an array of them."""
     return 10.0 ** (-psnr / 20.0)
 
 
 def psnr_of(error: Any) -> Any:
-    """PSNR in dB of an RMS error of brightness in [0, 1]; of arrays too."""
+    """PSNR in dB for an RMS error of brightness in [0, 1], or for an array of them."""
     return -20.0 * np.log10(np.maximum(error, 1e-12))
 
 
 def step_breakdown(runs: Sequence[tuple[str, dict[str, float]]]) -> Figure:
-    """What a training step spends its time on, a bar a run.
+    """Bar chart of the time of a training step by part, with one bar for each run.
 
     Args:
-        runs: Name, and seconds of a step by what they are spent on; at least one.
+        runs: Name, and seconds of a step by part; at least one.
     """
     from matplotlib.figure import Figure
 
@@ -194,12 +197,12 @@ def step_breakdown(runs: Sequence[tuple[str, dict[str, float]]]) -> Figure:
 
 
 def shortened(name: str, length: int) -> str:
-    """A name of at most so many characters: where it is longer, its two ends."""
+    """A name of at most `length` characters: both ends of a longer name, with … between them."""
     return name if len(name) <= length else f"{name[: length // 2]}…{name[1 - length + length // 2 :]}"
 
 
 def _legend(axis: Axes, runs: Sequence[Curve], marks: Sequence[tuple[str, str, int, Any, str]]) -> None:
-    """Runs, and what marks mean (marker, colour, size, how it is filled, words), above a plot."""
+    """Adds a legend of runs and of marks (marker, colour, size, fill style, label) above a plot."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -213,7 +216,7 @@ def _legend(axis: Axes, runs: Sequence[Curve], marks: Sequence[tuple[str, str, i
 
 
 def _logarithmic(axes: Axes, which: Literal["x", "y"], values: Sequence[float]) -> None:
-    """Makes an axis logarithmic, with numbers as a person writes them, also where it spans hardly a factor."""
+    """Makes an axis logarithmic with plain numbers, even if the values span less than a factor of 4."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     axes.set(**{f"{which}scale": "log"})

@@ -1,11 +1,10 @@
-"""Moving pictures of a trained run, as one likes to look at them: large enough, and bright enough for a screen."""
+"""The two films of a trained run, video.mp4 and moving.webp, at a brightness that suits a screen."""
 
 from __future__ import annotations
 
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,33 +29,33 @@ from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.method.pipeline import EnerfPipeline
 
 MIDDLE_GREY = 0.5
-"""What the median brightness is shown as, where the screen's gamma suffices for that."""
+"""Displayed value of the median brightness, as far as a gamma of at most `SCREEN_GAMMA` can reach it."""
 SCREEN_GAMMA = 2.2
-"""Gamma of screens: linear brightness to the power of 1 / 2.2 is what they show as it is. What was encoded by a camera
-already, and so is bright enough, takes less."""
+"""Gamma of screens, which display brightness^(1 / 2.2) as linear brightness. Frames that a camera has already encoded
+need less."""
 VIDEO_SIDE, MOVING_SIDE = 480, 240
-"""Width of each picture of the video at least, and of those that move, pixels."""
+"""Least width of each picture in video.mp4, and width of each picture in moving.webp, pixels."""
 MOVING_FRAMES, MOVING_MS, MOVING_PIXELS = 40, 90, 160 * 120
-"""Pictures that move, for how long each is shown, and how many pixels of each are rendered at most."""
+"""Pictures of moving.webp, milliseconds that each is shown, and most pixels of each that are rendered."""
 GAP = 8
-"""Pixels between pictures side by side."""
+"""Pixels between two pictures side by side."""
 
 
 @dataclass(frozen=True)
 class Screen:
-    """How brightness and depth are shown."""
+    """Display of brightness and depth."""
 
     correct: Callable[[Tensor], Tensor]
-    """From the field's linear brightness to that of the frames."""
+    """From the field's linear brightness to the linear brightness of the frames."""
     exponent: float
-    """Power to which brightness is shown."""
+    """Exponent of brightness for display."""
     near: float
     far: float
     """Depths in metres at the ends of the colours."""
 
     @classmethod
     def of(cls, views: Sequence[HeldOutView], depth_range: tuple[float, float]) -> Screen:
-        """One on which these views, with their brightness as the field has it, look well."""
+        """A display that suits views, whose brightness is not aligned, and a depth range in metres."""
         correct = _correction(views)
         shown = torch.cat([correct(view.rendered.double()).clamp(0, 1).flatten() for view in views])
         median = float(shown[shown.isfinite()].median().clamp(1e-6, 0.999)) if shown.isfinite().any() else MIDDLE_GREY
@@ -64,7 +63,7 @@ class Screen:
         return cls(correct, exponent, *depth_range)
 
     def brightness(self, rendered: Float[Tensor, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """The field's linear brightness as it is shown."""
+        """The field's linear brightness as displayed, 0 to 255."""
         corrected = self.correct(rendered.cpu().double()).nan_to_num().clamp(0.0, 1.0)
         return (255.0 * corrected**self.exponent).round().byte().numpy()
 
@@ -77,12 +76,12 @@ class Screen:
 
     @property
     def gamma(self) -> str:
-        """What is done to brightness, in words."""
+        """The display of brightness, in words."""
         return f"brightness^(1/{1 / self.exponent:.1f})" if self.exponent < 1 else "brightness"
 
 
 def _correction(views: Sequence[HeldOutView]) -> Callable[[Tensor], Tensor]:
-    """The default protocol's fit of the views to their frames; where there is none, the brightest becomes white."""
+    """The default protocol's fit of renders to frames. Without a fit, the 0.99 quantile of brightness becomes white."""
     framed = [view for view in views if view.recorded is not None and view.rendered.isfinite().all()]
     fit = PROTOCOLS[DEFAULT_PROTOCOL].fit
     if framed and fit is not None:
@@ -99,16 +98,16 @@ def _correction(views: Sequence[HeldOutView]) -> Callable[[Tensor], Tensor]:
 
 
 def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], output: Path) -> None:
-    """Render a flight: brightness beside depth, each `VIDEO_SIDE` wide at least, with a scale of metres.
+    """Renders a flight: brightness beside depth, with a scale of depth in metres.
 
     Args:
-        pipeline: Of a trained run.
-        screen: How it is shown.
-        path: As the viewer saves it.
-        output: The .mp4 file, which is whole afterwards, or as it was before.
+        pipeline: Pipeline of a trained run.
+        screen: Display of brightness and depth.
+        path: Camera path in the format of Nerfstudio's viewer.
+        output: The .mp4 file. If rendering fails, the previous file stays.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     cameras = get_path_from_json(path)
     width = max(VIDEO_SIDE, int(path["render_width"]))
@@ -119,20 +118,24 @@ def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], 
             rays = cameras[number : number + 1].to(pipeline.device).generate_rays(camera_indices=0, keep_shape=True)
             yield _below([_scaled(side, width) for side in _sides(pipeline, screen, rays)], strip)
 
-    with _partial(output) as partial:
+    partial = partial_of(output)
+    try:
         _write_mp4(partial, pictures(), int(path["fps"]))
+        partial.replace(output)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None:
-    """Render what the event camera saw: events, brightness and depth along the recorded path, a small animated WebP.
+    """Renders a small animated WebP: events, brightness and depth along the recorded path.
 
     Args:
-        pipeline: Of a trained run.
-        screen: How it is shown.
-        output: The .webp file, which is whole afterwards, or as it was before.
+        pipeline: Pipeline of a trained run.
+        screen: Display of brightness and depth.
+        output: The .webp file. If rendering fails, the previous file stays.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     manager = pipeline.datamanager
     recording = manager.recording
@@ -162,7 +165,7 @@ def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None
 
 @torch.no_grad()
 def _sides(pipeline: EnerfPipeline, screen: Screen, rays: RayBundle) -> list[np.ndarray]:
-    """Brightness and depth along rays (height, width)."""
+    """Pictures of brightness and depth along rays (height, width)."""
     pipeline.eval()
     outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
     scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
@@ -171,13 +174,13 @@ def _sides(pipeline: EnerfPipeline, screen: Screen, rays: RayBundle) -> list[np.
 
 
 def _scaled(picture: UInt8[np.ndarray, "height width 3"], width: int) -> UInt8[np.ndarray, "tall wide 3"]:
-    """The picture at another width, by Lanczos where it grows."""
+    """The picture scaled to another width, by Lanczos interpolation if it grows."""
     size = width, round(picture.shape[0] * width / picture.shape[1])
     return cv2.resize(picture, size, interpolation=cv2.INTER_LANCZOS4 if width > picture.shape[1] else cv2.INTER_AREA)
 
 
 def _below(sides: Sequence[np.ndarray], strip: np.ndarray) -> np.ndarray:
-    """Pictures side by side on white above what explains them, with sides even, as players want them."""
+    """Pictures side by side above their legend, with an even width and height, which players require."""
     gap = np.full((len(sides[0]), GAP, 3), 255, np.uint8)
     row = np.concatenate([part for side in sides for part in (gap, side)][1:], axis=1)
     whole = np.concatenate([row, strip], axis=0)
@@ -185,7 +188,7 @@ def _below(sides: Sequence[np.ndarray], strip: np.ndarray) -> np.ndarray:
 
 
 def _strip(width: int, explained: dict[str, Any]) -> UInt8[np.ndarray, "height wide 3"]:
-    """What explains pictures side by side, of this width each: a title, and below it colours or a scale of depth."""
+    """The legend below pictures of this width: for each its title, and its colours or its scale of depth."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -214,19 +217,8 @@ def _strip(width: int, explained: dict[str, Any]) -> UInt8[np.ndarray, "height w
     return fitting
 
 
-@contextmanager
-def _partial(output: Path) -> Iterator[Path]:
-    """A file beside another, in place of which it comes where the block ends well; it is gone otherwise."""
-    partial = partial_of(output)
-    try:
-        yield partial
-        partial.replace(output)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 def _write_mp4(file: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
-    """Encodes pictures of one size as H.264.
+    """Encodes pictures of one size as H.264 in an MP4 file.
 
     Raises:
         OutputError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""What a trained run shows: held-out frames side by side with what was recorded, and a flight past their cameras."""
+"""Pictures of a trained run: held-out frames beside their renders, and a camera path past their poses."""
 
 from __future__ import annotations
 
@@ -27,48 +27,48 @@ if TYPE_CHECKING:
 PICTURE_ROWS = 3
 """Number of held-out frames shown in the picture."""
 POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event": NO_EVENT}
-"""What the colours of an `event_picture` mean."""
+"""Colours of an `event_picture` by meaning."""
 UNKNOWN = "#c9ced8"
-"""Grey where a value is not known."""
+"""Colour of unknown values, grey."""
 FAINTEST = 0.15
-"""Opacity of depth that nothing is known of."""
+"""Opacity of depth whose confidence is 0."""
 KEY_POSES = 7
 """Number of held-out cameras that the video flies past."""
 VIDEO_SECONDS, VIDEO_FPS = 5.0, 20
 VIDEO_PIXELS = 320 * 240
-"""Pixels of a frame of the video at most, so that it takes a minute on two cores; larger cameras are shown reduced."""
+"""Most pixels of a frame of the video, so that it takes a minute on two CPU cores. Larger cameras are reduced."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """What is shown of every view, one below the other."""
+    """One column of the picture, with a cell for each view."""
 
     title: str
     pictures: Sequence[np.ndarray | None]
-    """Of each view: colours in [0, 1] (height, width, 3), or values (height, width), not a number where unknown."""
+    """For each view, colours in [0, 1] (height, width, 3), or values (height, width), which are NaN if unknown."""
     bar: str = ""
-    """What the values are, with their unit."""
+    """Label of the values with their unit; empty if the pictures are colours."""
     colours: str = ""
     limits: tuple[float, float] = (0.0, 1.0)
-    """Values at the ends of the colours."""
+    """Values at both ends of the colour scale."""
     opacities: Sequence[np.ndarray] | None = None
-    """Of each picture, from 0, where only the grey behind it is seen, to 1 (height, width). None: 1."""
+    """Opacity of each picture over grey, 0 to 1 (height, width). None: 1."""
 
 
 def shown_numbers(number: int) -> list[int]:
-    """Which of the held-out frames are shown."""
+    """Numbers of the held-out frames that are shown, evenly chosen."""
     return np.unique(np.linspace(0, number - 1, PICTURE_ROWS).round().astype(int)).tolist()
 
 
 def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> Figure:
-    """Frame, blurred frame, render, error, rendered, spread and true depth, and events of some held-out frames.
+    """Figure of held-out frames: frame, blurred frame, render, error, rendered, spread and true depth, and events.
 
-    What the recording does not have is left out.
+    Columns that the recording has no data for are left out.
 
     Args:
-        views: Those that are shown, at least one.
-        recording: Of which the events are. Of held-out frames on a clock of their own, events are not shown.
-        exponent: Power to which brightness is shown.
+        views: Views to show, at least one.
+        recording: Recording of the events. Events are not shown for held-out frames with a clock of their own.
+        exponent: Exponent of brightness for display.
     """
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -134,7 +134,7 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: 
             for view, frame in zip(views, recorded, strict=True)
         ]
         most = max(_quantile([error for error in errors if error is not None], 0.99, absolute=True), 0.01)
-        columns.append(Column("error", errors, "render - frame", "PuOr_r", (-most, most)))
+        columns.append(Column("error", errors, "render minus frame", "PuOr_r", (-most, most)))
     depths = [view.depth[..., 0].numpy() for view in views]
     true = [_known_depth(view) for view in views]
     of_scene = [depth for depth in true if depth is not None] or depths
@@ -143,12 +143,12 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: 
     spread = [view.spread_depth[..., 0].numpy() for view in views if view.spread_depth is not None]
     faded = [(confidence / KNOWN).clip(FAINTEST, 1.0) for confidence in sure] or None
     columns.append(
-        Column("rendered depth", depths, "metres; pale: not known" if sure else "metres", "viridis", limits, faded)
+        Column("rendered depth", depths, "metres (pale: uncertain)" if sure else "metres", "viridis", limits, faded)
     )
     if spread:
         columns.append(Column("spread depth", spread, "metres", "viridis", limits))
     if any(depth is not None for depth in true):
-        columns.append(Column("true depth", true, "metres; grey: unknown", "viridis", limits))
+        columns.append(Column("true depth", true, "metres (grey: unknown)", "viridis", limits))
     if recording.held_out_frames is None:
         index = index_events(recording)
         columns.append(Column("events", [event_picture(index, recording.camera, view.time) for view in views]))
@@ -156,7 +156,7 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: 
 
 
 def _blurred_frame(recording: EventRecording, time: int) -> np.ndarray | None:
-    """The blurred frame of an instant, undistorted, in [0, 1], (height, width, 3)."""
+    """The blurred frame at an instant (ns), undistorted, in [0, 1] (height, width, 3); None if there is none."""
     frames = recording.blurred_frames
     if frames is None or recording.held_out_frames is not None or time not in frames.times:
         return None
@@ -165,22 +165,22 @@ def _blurred_frame(recording: EventRecording, time: int) -> np.ndarray | None:
 
 
 def _known_depth(view: HeldOutView) -> np.ndarray | None:
-    """Recorded depth, not a number where it is unknown, (height, width)."""
+    """Recorded depth in metres, NaN where it is unknown (height, width)."""
     depth = view.recorded_depth
     return None if depth is None else torch.where(is_known(depth), depth, torch.nan)[..., 0].numpy()
 
 
 def _quantile(pictures: Sequence[np.ndarray], share: float, absolute: bool = False, otherwise: float = 0.0) -> float:
-    """Quantile of the finite values of all pictures; another number where there is none."""
+    """Quantile of the finite values of all pictures; `otherwise` if there are none."""
     values = np.concatenate([picture[np.isfinite(picture)] for picture in pictures])
     return float(np.quantile(np.abs(values) if absolute else values, share)) if len(values) else otherwise
 
 
 def camera_path(cameras: Cameras) -> dict:
-    """A smooth flight past some of the cameras, as the viewer saves it and `ns-render camera-path` reads it.
+    """A smooth flight past cameras, in the format that the viewer saves and `ns-render camera-path` reads.
 
-    Cubic through the places of `KEY_POSES` cameras, slerp between their directions, with sides of the picture even, as
-    video players want them, and `VIDEO_PIXELS` at most.
+    A cubic spline joins the positions of `KEY_POSES` cameras, and slerp their rotations. Pictures have at most
+    `VIDEO_PIXELS` pixels, and an even width and height, which video players require.
     """
     chosen = np.unique(np.linspace(0, len(cameras) - 1, KEY_POSES).round().astype(int))
     poses = cameras.camera_to_worlds[chosen].double().cpu().numpy()

@@ -1,4 +1,4 @@
-"""What was corrected of a trajectory, drawn."""
+"""Figure of the corrections of a trajectory."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.recording.recording import EventRecording
-from enerf_ns.report.figures import COLOURS, GREY, WIDTH
+from enerf_ns.report.figures import COLOURS, GREY, WIDTH, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INSTANTS = 400
-"""Instants of the recording that are drawn."""
+"""Number of instants that are drawn."""
 
 
 def corrections_over_time(recording: EventRecording) -> Figure | None:
-    """The path as it was stated and as it was refined, seen along the axis in which it is shortest; and shift and
-    rotation from one to the other over time, in the axes of the camera. None where nothing was refined."""
+    """Figure of a recorded and a refined path; None if the poses were not refined.
+
+    The view is along the axis in which the path is shortest. Two plots below show the shift in mm and the rotation in
+    degrees between both paths over time, in the axes of the camera.
+    """
     if recording.as_read is None:
         return None
     from matplotlib.figure import Figure
@@ -38,8 +41,8 @@ def corrections_over_time(recording: EventRecording) -> Figure | None:
 
     figure = Figure(figsize=(WIDTH, 7.0), layout="constrained", dpi=150)
     path, *others = figure.subplots(3, 1, height_ratios=(2, 1, 1))
-    path.plot(*stated[:, (across, up), 3].T, color=GREY, linestyle="--", label="as stated")
-    path.plot(*refined[:, (across, up), 3].T, color=COLOURS[0], label="as refined")
+    path.plot(*stated[:, (across, up), 3].T, color=GREY, linestyle="--", label="recorded")
+    path.plot(*refined[:, (across, up), 3].T, color=COLOURS[0], label="refined")
     path.set_xlabel(f"{'xyz'[across]}, m")
     path.set_ylabel(f"{'xyz'[up]}, m")
     path.set_aspect("equal", adjustable="datalim")
@@ -52,6 +55,5 @@ def corrections_over_time(recording: EventRecording) -> Figure | None:
     others[1].sharex(others[0])
     others[1].set_xlabel("time, s")
     for axis in (path, *others):
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain(axis)
     return figure

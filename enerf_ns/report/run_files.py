@@ -1,4 +1,4 @@
-"""What the files of a run tell before anything is loaded: its configuration, its history, and how far it came."""
+"""Configuration, history and progress of a run, read from its files without loading the run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from enerf_ns.method.trainer import EnerfTrainerConfig
 
 RECENT_SECONDS = 600.0
-"""Age (s) of the newest file that training wrote, up to which a run that is not at its end counts as still going."""
+"""Age in seconds of the newest file of training up to which an unfinished run counts as still going."""
 
 WRITTEN_BY_TRAINING = ("config.yml", HISTORY_FILE, "events.out.*", "previews/*", "nerfstudio_models/*")
 """Patterns of the files that training writes into the folder of a run."""
@@ -25,36 +25,39 @@ WRITTEN_BY_TRAINING = ("config.yml", HISTORY_FILE, "events.out.*", "previews/*",
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run as its files show it."""
+    """The contents of the files of a run."""
 
     config_file: Path
     config: EnerfTrainerConfig
     history: list[HistoryRow]
-    """Oldest row first; empty where the run has none."""
+    """Rows, oldest first; empty if the run has no history."""
     steps: int
-    """Training steps done, as far as the files know."""
+    """Number of training steps done, according to the files."""
     stored: int
-    """Training steps that the newest whole checkpoint holds; 0 where there is none."""
+    """Number of training steps in the newest whole checkpoint; 0 if there is none."""
     state: str
-    """done, or how far it came, and whether it is still going, was stopped, or crashed."""
+    """In words: done, still going, stopped or crashed, with the number of steps."""
     notes: tuple[str, ...] = ()
-    """What is wrong with the files, a sentence each."""
+    """Problems of the files, one sentence each."""
 
     @property
     def folder(self) -> Path:
+        """Folder of the run."""
         return self.config_file.parent
 
     @property
     def learns_from(self) -> str:
-        """What the run learns from, in words."""
+        """Training data of the run, in words."""
         manager = self.config.pipeline.datamanager
         frames = "sharp frames" if manager.dataparser.train_frames == "sharp" else "blurred frames"
         return manager.supervision.replace("+", " and ").replace("frames", frames)
 
 
 def find_runs(path: Path) -> list[Path]:
-    """The folders of the runs in a folder and all folders below it, by name; the path itself where there are none, or
-    where it is a file."""
+    """Folders of all runs in and below a folder, sorted by name.
+
+    A path that is a run, a file, or a folder without runs is returned as it is.
+    """
     path = expanded(path)
     if (path / "config.yml").exists():
         return [path]
@@ -62,13 +65,13 @@ def find_runs(path: Path) -> list[Path]:
 
 
 def read_run(path: Path) -> RunFiles:
-    """What the files of a run tell.
+    """Reads the files of a run.
 
     Args:
         path: Folder of the run, or its config.yml.
 
     Raises:
-        RecordingError: It is no run, or one of a method of another package, or its files cannot be read.
+        RecordingError: The path is no run, or a run of another method, or its files cannot be read.
     """
     from nerfstudio.configs.method_configs import all_methods
 
@@ -98,13 +101,13 @@ def read_run(path: Path) -> RunFiles:
 
 
 def _state(config: EnerfTrainerConfig, history: list[HistoryRow], stored: int, age: float) -> str:
-    """How a run stands.
+    """The state of a run in words.
 
     Args:
-        config: Of the run.
-        history: Of the run.
-        stored: Steps done at the newest checkpoint, 0 where there is none.
-        age: Seconds since training wrote anything.
+        config: Configuration of the run.
+        history: History of the run.
+        stored: Number of steps in the newest checkpoint; 0 if there is none.
+        age: Seconds since training last wrote a file.
     """
     total = config.max_num_iterations
     recorded = history[-1].step if history else 0
@@ -120,7 +123,7 @@ def _state(config: EnerfTrainerConfig, history: list[HistoryRow], stored: int, a
 
 
 def run_names(runs: list[RunFiles]) -> list[str]:
-    """A name for each run: its experiment, with as much of method and time stamp as tells them apart."""
+    """A unique name for each run: its experiment, with method and timestamp only if they are needed."""
     for parts in (["experiment_name"], ["experiment_name", "method_name"], ["experiment_name", "timestamp"],
                   ["experiment_name", "method_name", "timestamp"]):  # fmt: skip
         names = ["/".join(str(getattr(run.config, part)) for part in parts) for run in runs]
@@ -130,16 +133,18 @@ def run_names(runs: list[RunFiles]) -> list[str]:
 
 
 def refined_recording(run: Path, data: Path) -> EventRecording:
-    """A recording with clock, poses and lens as a run refined them; `as_read` is what they were before, and None where
-    nothing was.
+    """A recording with the clock, poses and lens that a run refined.
 
     Args:
         run: Folder of the run, or its config.yml.
         data: Folder of the recording.
 
+    Returns:
+        The recording. Its `as_read` is the recording before the refinement, or None if the run refined nothing.
+
     Raises:
-        RecordingError: It is no run, or has no whole checkpoint.
-        FlagError: It was trained on another recording.
+        RecordingError: The path is no run, or the run has no whole checkpoint.
+        FlagError: The run was trained on another recording.
     """
     from enerf_ns.method.runs import load  # here, since PyTorch and Nerfstudio take seconds
 

@@ -1,4 +1,4 @@
-"""How a report scores held-out frames; apart from the report, so that its flags are told without loading Nerfstudio."""
+"""Scoring of held-out frames in a report, in a module of its own so that --help need not load Nerfstudio."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 @dataclass(frozen=True)
 class Scoring:
-    """How held-out frames are scored; by default as every run is at its end."""
+    """Scoring of held-out frames. The defaults are those of the scores at the end of every run."""
 
     protocol: str = DEFAULT_PROTOCOL
-    """What is done to the brightness of renders before they are compared: log-affine-set, log-affine-image, log-offset,
-    eventnerf, gamma-affine or raw."""
+    """Correction of the brightness of renders before they are compared with frames: log-affine-set, log-affine-image,
+    log-offset, eventnerf, gamma-affine or raw."""
     lpips: tuple[Net, ...] = ("alex",)
-    """Networks of LPIPS."""
+    """Networks of LPIPS: alex (AlexNet), vgg (VGG-16)."""
     crop: tuple[int, int] | None = None
-    """Height and width of the middle of each frame that alone is scored, pixels; None: all."""
+    """Height and width in pixels of the central part of each frame that is scored. Default: the whole frame."""
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:

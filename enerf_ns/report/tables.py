@@ -1,30 +1,35 @@
-"""Tables of runs: on a page, in Markdown, in the terminal; and their histories as CSV."""
+"""One kind of table for reports, benchmarks and checks, and the tables of runs."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
+
+from rich.markup import escape
+from rich.table import Table as RichTable
 
 from enerf_ns.evaluation.history import HistoryRow
 from enerf_ns.report.figures import AT_END, SCORES
 from enerf_ns.report.trade_offs import seconds_to_reach
 
 NONE = "-"
-"""Cell of what there is not."""
+"""Cell without a value."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Words and numbers in rows."""
+    """A table that is shown as Markdown, in a terminal, or on a page (`report.html`)."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
-    """What there is to know about it."""
+    """Sentences that explain the table."""
+    num_words: int = 1
+    """Number of columns, from the left, that hold words; the others hold numbers."""
 
     def markdown(self) -> str:
         """The table in Markdown, without its title."""
@@ -32,14 +37,31 @@ class Table:
         cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in lines]
         return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
+    def rich(self) -> RichTable:
+        """The table for the terminal."""
+        table = RichTable(title=escape(self.title), caption=escape(self.note), title_justify="left",
+                          caption_justify="left")  # fmt: skip
+        for number, name in enumerate(self.header):
+            table.add_column(escape(name), justify="left" if number < self.num_words else "right")
+        for row in self.rows:
+            table.add_row(*map(escape, row))
+        return table
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Rows as the text of a CSV file."""
+    content = io.StringIO()
+    csv.writer(content, lineterminator="\n").writerows(rows)
+    return content.getvalue()
+
 
 def score_cell(name: str, value: object) -> str:
-    """A score as text."""
+    """A score as text, or `NONE`."""
     return format(value, ".2f" if name == "psnr" else ".3f") if isinstance(value, (int, float)) else NONE
 
 
 def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Sequence[float]) -> Table:
-    """Training time to reach each PSNR, for runs by name."""
+    """Training time after which each run reaches each PSNR (dB)."""
     rows = []
     for name, history in runs:
         cells = []
@@ -50,20 +72,24 @@ def reach_table(runs: Sequence[tuple[str, Sequence[HistoryRow]]], targets: Seque
         rows.append([name, *cells])
     header = ["run", *(f"{target:g} dB" for target in targets)]
     note = (
-        "Training time until PSNR is first as high, linear between the two rows of the history around it; "
-        "at most: the first row is as good already."
+        "Training time until the run first has this PSNR, interpolated linearly between two rows of its history. At "
+        "most: the first row already has it."
     )
     return Table("Time to reach a PSNR", header, rows, note)
 
 
 def step_parts(history: Sequence[HistoryRow]) -> dict[str, float]:
-    """Seconds of a step by what they are spent on: of each part the median over the rows that measured it."""
+    """Seconds of each part of a training step: the median over the rows of a history that measured it."""
     parts = dict.fromkeys(part for row in history for part in row.parts)
     return {part: median(row.parts[part] for row in history if part in row.parts) for part in parts}
 
 
 def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
-    """Milliseconds and share of each part of a step, for runs by name."""
+    """Milliseconds and share of each part of a training step, by run.
+
+    Args:
+        runs: Name, and seconds by part.
+    """
     parts = list(dict.fromkeys(part for _, seconds in runs for part in seconds))
     rows = []
     for name, seconds in runs:
@@ -73,21 +99,20 @@ def step_table(runs: Sequence[tuple[str, dict[str, float]]]) -> Table:
             for part in parts
         ]
         rows.append([name, *cells, f"{1e3 * total:,.3g} ms"])
-    return Table("A training step", ["run", *parts, "in all"], rows, "Of each part the median over the history's rows.")
+    return Table(
+        "A training step", ["run", *parts, "total"], rows, "Each value is a median over the rows of the history."
+    )
 
 
 def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
-    """Every row of every history, with its `SCORES`; cells are empty where a row has no such score or loss."""
+    """All rows of all histories as CSV. The cell of a score or loss that a row lacks is empty."""
     rows = [(name, row) for name, history in runs for row in history]
     optional = ("lpips_vgg", *AT_END)
     scores = [name for name in SCORES if name not in optional or any(name in row.scores for _, row in rows)]
     losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
-    content = io.StringIO()
-    writer = csv.writer(content, lineterminator="\n")
-    writer.writerow(["run", "seconds", "step", *scores, "num_frames", *losses])
+    lines = [["run", "seconds", "step", *scores, "num_frames", *losses]]
     for name, row in rows:
         values = [row.scores.get(score, "") for score in scores]
-        writer.writerow(
-            [name, row.seconds, row.step, *values, row.num_frames, *(row.losses.get(loss, "") for loss in losses)]
-        )
-    return content.getvalue()
+        terms = [row.losses.get(loss, "") for loss in losses]
+        lines.append([name, row.seconds, row.step, *values, row.num_frames, *terms])
+    return csv_text(lines)

@@ -1,4 +1,4 @@
-"""How good a run is for the time it took: the Pareto front of several, and the time to reach a score."""
+"""Quality of runs against their time: the Pareto front, and the time to reach a score."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from math import floor
 from enerf_ns.evaluation.history import HistoryRow
 
 NUM_TARGETS, TARGET_STEP = 4, 2
-"""Number of scores to reach that are chosen from the data, and how many dB they lie apart."""
+"""Number of default targets, and their distance in dB."""
 
 
 def pareto_front(costs: Sequence[tuple[float, float]]) -> list[bool]:
-    """Of each pair of costs, such as time and error, whether no other is as low in both and lower in one."""
+    """Whether each pair of costs, such as time and error, is on the Pareto front.
+
+    A pair is on the front if no other pair is as low in both costs and lower in one.
+    """
     front, best = [False] * len(costs), float("inf")
     order = sorted(range(len(costs)), key=lambda number: costs[number])
     for place, number in enumerate(order):
@@ -24,16 +27,16 @@ def pareto_front(costs: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def seconds_to_reach(history: Sequence[HistoryRow], score: str, target: float) -> tuple[float, bool] | None:
-    """Training time after which a score, of which more is better, is reached for the first time.
+    """Training time after which a run first reaches a score.
 
     Args:
-        history: Oldest row first.
-        score: Its name among the scores of a row.
-        target: What it is to reach.
+        history: Rows, oldest first.
+        score: Name of a score that is better the higher it is.
+        target: Value to reach.
 
     Returns:
-        Seconds, by linear interpolation between the first row that reaches it and the one before; and whether that
-        one is the first of all, so that it was reached at some time before. None: never.
+        Seconds, interpolated linearly between the first row that reaches the target and the row before it; and whether
+        the first row of all reaches it, so that the seconds are an upper bound. None: no row reaches the target.
     """
     before: tuple[float, float] | None = None
     for row in history:
@@ -50,7 +53,7 @@ def seconds_to_reach(history: Sequence[HistoryRow], score: str, target: float) -
 
 
 def default_targets(histories: Sequence[Sequence[HistoryRow]], score: str) -> list[float]:
-    """A few scores that some run reaches and that lie above what every run begins with."""
+    """Up to `NUM_TARGETS` values that some run reaches and that lie above the lowest value of all runs."""
     values = [row.scores[score] for history in histories for row in history if score in row.scores]
     if not values:
         return []

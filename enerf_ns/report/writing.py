@@ -1,4 +1,4 @@
-"""The report of one or several runs: a page, Markdown, a CSV file, scores and pictures."""
+"""The report of one or several runs: an HTML page, Markdown, a CSV file, scores and pictures."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
 from enerf_ns.dataparsers.recording.files import fill_page, write_together
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
-from enerf_ns.evaluation.history import HistoryRow
-from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL, described
+from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views
 from enerf_ns.method.held_out_views import held_out_views, scores_at_stated_poses
@@ -38,48 +37,43 @@ from enerf_ns.report.trade_offs import default_targets
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LARGEST_EMBEDDED_VIDEO = 8_000_000
-"""Bytes up to which a video is put into the page; a larger one is a file beside it."""
-
-CSV_FILE = "error-against-time.csv"
-
 
 @dataclass
 class _Reported:
-    """A run, and what its report says of it."""
+    """A run with the contents of its report."""
 
     files: RunFiles
     name: str = ""
     prefix: str = ""
-    """What the names of the run's own files begin with."""
+    """Beginning of the names of the run's own files: empty, or a folder."""
     scores: dict[str, Any] = field(default_factory=dict)
     protocol: str = DEFAULT_PROTOCOL
-    """How the scores are taken."""
+    """Name of the protocol of the scores."""
     step: int = 0
-    """Step whose field is scored."""
+    """Training step of the field that is scored."""
     num_frames: int = 0
-    """Held-out frames that the scores are over."""
+    """Number of held-out frames that are scored."""
     over_all_frames: bool = False
     seconds: float | None = None
-    """Training time up to that step."""
+    """Training time up to the scored step, s."""
     events: int | None = None
     picture: tuple[str, bytes] | None = None
-    """Name and content of the file with the pictures."""
+    """Name and content of the file with the held-out frames."""
     video: bytes | None = None
     video_note: str = ""
-    """What the video shows, and with which gamma."""
+    """Caption of the video."""
     poses: list[dict[str, Any]] = field(default_factory=list)
-    """What was found to be wrong with clock, poses and lens, as `Finding.as_dict`."""
+    """Errors that were found in clock, poses and lens, as `Finding.as_dict` gives them."""
     corrections: bytes | None = None
-    """Picture of what was corrected of the poses."""
+    """PNG of the corrections of the poses."""
     at_stated_poses: dict[str, float] = field(default_factory=dict)
-    """Scores at the poses as they were stated, where others are used."""
+    """Scores at the poses of the recording, if the run refined them."""
     captions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    """What is left out or wrong, and what to do about it."""
+    """Sentences about missing parts of the report, with advice."""
 
     def entry(self) -> dict[str, Any]:
-        """What scores.json holds of the run."""
+        """The entry of the run in scores.json."""
         entry: dict[str, Any] = {"state": self.files.state, "step": self.step, "train_seconds": self.seconds}
         entry |= {"events": self.events} if self.events is not None else {}
         over = {"protocol": self.protocol, "num_frames": self.num_frames} if self.scores else {}
@@ -93,27 +87,28 @@ def write_report(
     scoring: Scoring = DEFAULT_SCORING,
     video: bool = True,
 ) -> dict[str, dict[str, Any]]:
-    """Write report.html, report.md, error-against-time.csv, scores.json, the plots, and of each run that can be loaded
-    side-by-side.png, camera_path.json, video.mp4 and moving.webp; of several runs, these in a folder for each.
+    """Writes a report of runs.
 
-    Scores are those of the last row of the run's history where it is at its end, else those of the newest whole
-    checkpoint; where neither is to be had, those of the last row that has some, over a few frames.
+    The files are report.html, report.md, error-against-time.csv, scores.json and the plots. Each run that can be loaded
+    adds side-by-side.png, camera_path.json, video.mp4 and moving.webp. With several runs, each has a folder for these.
+
+    Scores of a finished run are those at the end of its history. Scores of another run are those of its newest whole
+    checkpoint, or, if there is none, those of the last row of its history that has scores, over a few frames.
 
     Args:
-        runs: Runs, or their folders or files config.yml, at least one. Those that cannot be read are a row that says
-            why.
-        output_dir: Made if it does not exist.
-        reach: PSNR (dB) whose time is told. None: some that the runs reach.
-        scoring: Another way of scoring, for which held-out frames are rendered anew.
-        video: Whether to render a flight past the held-out cameras, and what was seen along the recorded path.
+        runs: At least one run, folder of a run, or config.yml. A run that cannot be read becomes a row with the reason.
+        output_dir: Folder, made if it does not exist.
+        reach: Values of PSNR in dB for the table of times. None: up to four values that a run reaches.
+        scoring: Scoring of held-out frames. With other values than the defaults, they are rendered again.
+        video: Whether to render video.mp4 and moving.webp.
 
     Returns:
-        What scores.json holds: by the name of each run, its state, step, train_seconds, events, and scores.
+        The contents of scores.json: state, step, train_seconds, events and scores by the name of each run.
 
     Raises:
         RecordingError: No run can be read.
-        FlagError: There is no such way of scoring.
-        OutputError: The folder cannot be written to, or the disk is full, or it lies within a recording.
+        FlagError: The crop of the scoring is larger than the frames.
+        OutputError: The folder cannot be written to, or the disk is full, or the folder lies within a recording.
     """
     reported, unread = _read(runs)
     check_outside_recordings("--output-dir", output_dir, *(one.files.config.data for one in reported))
@@ -130,7 +125,7 @@ def write_report(
 
 
 def _read(runs: Sequence[Run | Path]) -> tuple[list[_Reported], dict[str, str]]:
-    """The runs, each once, and by their paths, why others cannot be read."""
+    """The runs without duplicates, and, by path, the reasons why other runs cannot be read."""
     if not runs:
         raise FlagError("No run is given; give the folder of a run, or of several.")
     read: dict[Path, RunFiles] = {}
@@ -169,7 +164,7 @@ def _writing_to(folder: Path) -> Iterator[None]:
 
 
 def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring, video: bool) -> None:
-    """Fills in scores, pictures and video of a run, as far as they can be had."""
+    """Fills in scores, pictures and video of a run, as far as its files allow."""
     history = one.files.history
     scored = next((row for row in reversed(history) if row.scores or row.not_scored), None)
     at_end = bool(scored and scored.final)
@@ -177,7 +172,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
         one.scores = {**dict.fromkeys(("psnr", "ssim", "lpips")), **scored.scores}
         one.scores |= {"not_scored": scored.not_scored} if scored.not_scored else {}
-        one.protocol = scored.protocol or _earlier_protocol(one.files, scored)
+        one.protocol = scored.protocol
     else:
         one.step = one.files.steps
     if run is None:
@@ -205,8 +200,9 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         screen = Screen.of(views, depth_range)
         views, _ = aligned_views(views, scoring.protocol)
         one.captions.append(
-            f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)}, counted from 0, after {stored:,} steps. "
-            f"Error: orange where the render is too bright, purple where it is too dark. Shown as {screen.gamma}."
+            f"Held-out frames {', '.join(map(str, shown))} of {len(dataset)} (numbers start at 0) after {stored:,} "
+            "training steps. In the column of errors, orange means that the render is too bright, and purple that it "
+            f"is too dark. Brightness is displayed as {screen.gamma}."
         )
         picture = _png(side_by_side(views, dataset.recording, screen.exponent))
         path = camera_path(dataset.cameras)
@@ -221,8 +217,8 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
                 render_moving(run.pipeline, screen, folder / "moving.webp")
                 render_video(run.pipeline, screen, path, folder / "video.mp4")
                 one.video_note = (
-                    f"A flight past the held-out cameras: {screen.gamma}, so that linear brightness looks right on a "
-                    "screen, and depth. moving.webp shows events, render and depth along the recorded path."
+                    f"Flight past the held-out cameras: {screen.gamma} on the left, depth on the right. The file "
+                    "moving.webp shows events, render and depth along the recorded path."
                 )
                 one.video = (folder / "video.mp4").read_bytes()
     else:
@@ -233,25 +229,18 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         one.seconds = run.train_seconds
 
 
-def _earlier_protocol(files: RunFiles, row: HistoryRow) -> str:
-    """The protocol of a row of an earlier version, which named none."""
-    if not row.num_frames:
-        return EVENTS_PROTOCOL
-    return "log-affine-set" if "events" in files.config.pipeline.datamanager.supervision else "raw"
-
-
 def _loaded(one: _Reported) -> Run | None:
-    """The run, or None, and a note that says why."""
-    left_out = "so pictures, video and scores of the field as it is are left out"
+    """The loaded run. If it cannot be loaded, None, and a note with the reason is added."""
+    left_out = "so pictures, video and new scores are left out"
     recording = one.files.config.data
     if recording is not None and not recording.exists():
         one.notes.append(
-            f"The recording {recording} is not there any more, {left_out}: put it back, or a link to it (ln -s NEW "
-            f"{quoted(recording)}), and call enerf report again."
+            f"The recording {recording} is not there any more, {left_out}; put it back, or a link to it (ln -s NEW "
+            f"{quoted(recording)}), and run enerf report again."
         )
         return None
     if not one.files.stored:
-        one.notes.append(f"No whole checkpoint is stored, {left_out}: wait for one, or train again.")
+        one.notes.append(f"No whole checkpoint is stored, {left_out}; wait for one, or train again.")
         return None
     try:
         return load(one.files.config_file)
@@ -261,11 +250,11 @@ def _loaded(one: _Reported) -> Run | None:
 
 
 def _take_preview(one: _Reported) -> None:
-    """Shows the newest picture that training left, where there is one."""
+    """Takes the newest preview that training wrote, if there is one."""
     previews = sorted((one.files.folder / "previews").glob("step-*.png"))
     if previews:
         one.picture = f"{one.prefix}preview.png", previews[-1].read_bytes()
-        one.captions.append(f"The newest preview of the training, {previews[-1].name}.")
+        one.captions.append(f"Newest preview that training wrote: {previews[-1].name}.")
 
 
 def _files(
@@ -274,7 +263,7 @@ def _files(
     reach: Sequence[float] | None,
     entries: dict[str, dict[str, Any]],
 ) -> dict[str, bytes]:
-    """All files of a report but those of each run."""
+    """The files of a report by name, except those of single runs."""
     histories = [(one.name, one.files.history) for one in reported]
     curves = [
         Curve(one.name, one.files.history, one.seconds, _numbers(one.scores), one.over_all_frames) for one in reported
@@ -288,9 +277,9 @@ def _files(
         tables.append(step_table(steps))
     plots = {
         "error-against-seconds.png": ("Error against training time", error_against("seconds", curves)),
-        "error-against-steps.png": ("Error against steps", error_against("step", curves)),
-        "work-precision.png": ("Error and the time it took", work_precision(curves)),
-        "step.png": ("What a training step spends its time on", step_breakdown(steps) if steps else None),
+        "error-against-steps.png": ("Error against training steps", error_against("step", curves)),
+        "work-precision.png": ("Final error against training time", work_precision(curves)),
+        "step.png": ("Time of a training step by part", step_breakdown(steps) if steps else None),
     }
     figures = {name: (title, _png(figure)) for name, (title, figure) in plots.items() if figure is not None}
     tables += [_poses_table(one, len(reported) > 1) for one in reported if one.poses]
@@ -302,7 +291,7 @@ def _files(
     return {
         "report.html": _page(reported, tables, figures).encode(),
         "report.md": _markdown(reported, tables, {name: title for name, (title, _) in figures.items()}).encode(),
-        CSV_FILE: history_csv(histories).encode(),
+        "error-against-time.csv": history_csv(histories).encode(),
         "scores.json": (json.dumps(entries, indent=2) + "\n").encode(),
         **{name: content for name, (_, content) in figures.items()},
         **{one.picture[0]: one.picture[1] for one in reported if one.picture},
@@ -314,17 +303,19 @@ def _numbers(scores: dict[str, Any]) -> dict[str, float]:
 
 
 def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Table:
-    """Scores, time and state of each run; columns that no run has are left out."""
+    """Scores, time and state of each run. Columns without any value are left out."""
     rows = [
         {
             "run": one.name,
             "state": one.files.state,
             "scored after": f"{one.step:,} steps" if one.scores else NONE,
-            "training": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
+            "training time": NONE if one.seconds is None else f"{one.seconds:,.4g} s",
             **{label: score_cell(name, one.scores.get(name)) for name, label in SCORES.items()},
             "brightness scale": _brightness_scale(one),
-            "over": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames} frames" if one.num_frames else NONE,
-            "of them on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
+            "scored frames": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames}"
+            if one.num_frames
+            else NONE,
+            "on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
             "protocol": one.protocol if one.scores else NONE,
         }
         for one in reported
@@ -334,12 +325,12 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
     protocols = dict.fromkeys(one.protocol for one in reported if one.scores)
     note = " ".join(
         [
-            "Means over held-out frames. Training is the time of training steps alone, up to the step that is scored.",
-            "On the path are held-out poses that lie among those that were learnt from."
-            * ("of them on the path" in header),
-            "The brightness scale is the factor by which the fit multiplies the contrast of renders; in brackets is "
-            "what it should be, the sensor's mean threshold over the one learnt with, where the recording states it."
-            * ("brightness scale" in header),
+            "Scores are means over held-out frames. Training time is that of the training steps alone, up to the "
+            "scored step.",
+            "A held-out frame is on the path if its pose lies among the training poses." * ("on the path" in header),
+            "The brightness scale is the factor by which the fit multiplies the contrast of renders. The expected "
+            "value is in brackets, if the recording states it: the sensor's mean contrast threshold divided by the one "
+            "that training used." * ("brightness scale" in header),
             *map(described, protocols),
         ]
     )
@@ -347,8 +338,10 @@ def _scores_table(reported: Sequence[_Reported], unread: dict[str, str]) -> Tabl
 
 
 def _brightness_scale(one: _Reported) -> str:
-    """Scale of the brightness fit, of each channel that has one, and what it should be, of a run that learnt from
-    events, whose contrast is in thresholds."""
+    """Brightness scale of each fitted channel, and in brackets the expected one.
+
+    Only a run that learns from events has it, because the contrast of its field is in units of the thresholds.
+    """
     names = [name for name in one.scores if name.startswith("brightness_scale") and name != EXPECTED_SCALE]
     if not names or one.protocol != DEFAULT_PROTOCOL or "events" not in one.files.learns_from:
         return NONE
@@ -358,7 +351,7 @@ def _brightness_scale(one: _Reported) -> str:
 
 
 def _runs_table(reported: Sequence[_Reported]) -> Table:
-    """What each run is."""
+    """Method, recording, seed, device and folder of each run."""
     rows = []
     for one in reported:
         config = one.files.config
@@ -368,7 +361,7 @@ def _runs_table(reported: Sequence[_Reported]) -> Table:
             [one.name, config.method_name, one.files.learns_from, recording, events, str(config.machine.seed),
              config.machine.device_type, str(one.files.folder)]
         )  # fmt: skip
-    return Table("Runs", ["run", "method", "learns from", "recording", "events", "seed", "device", "folder"], rows)
+    return Table("Runs", ["run", "method", "training data", "recording", "events", "seed", "device", "folder"], rows)
 
 
 def _of_run(title: str, one: _Reported, of_several: bool) -> str:
@@ -376,53 +369,52 @@ def _of_run(title: str, one: _Reported, of_several: bool) -> str:
 
 
 def _poses_table(one: _Reported, of_several: bool) -> Table:
-    """What was found to be wrong with clock, poses and lens of a run."""
+    """Errors that were found in clock, poses and lens of a run."""
     rows = [
         [
             row["what"],
-            "corrected" if row["is_corrected"] else "as stated",
+            "corrected" if row["is_corrected"] else "not corrected",
             row["value"] if row["is_identifiable"] else f"not identifiable ({row['value']})",
             f"{row['pixels']:.2g} pixels" if row["is_corrected"] else NONE,
             row["flag"],
         ]
         for row in one.poses
     ]
-    note = "With standard errors. A part that is not identifiable, or not significantly wrong, stays as it was stated."
+    note = (
+        "Values have standard errors. A part that the events do not determine, or whose error is not significant, "
+        "keeps the value of the recording."
+    )
     if one.at_stated_poses:
         scores = ", ".join(f"{SCORES[name]} {score_cell(name, value)}" for name, value in one.at_stated_poses.items())
         note += (
-            " All scores above are at the corrected poses, which no held-out frame was fitted to; at the poses as they "
-            f"were stated: {scores}."
+            " All scores above are at the corrected poses, which were not fitted to held-out frames. Scores at the "
+            f"poses of the recording: {scores}."
         )
-    header = ["part", "", "found", "moves the picture by", "flag"]
+    header = ["part", "correction", "error", "image motion", "flag"]
     return Table(_of_run("Clock, poses and lens", one, of_several), header, rows, note)
 
 
 def _not_scored(one: _Reported) -> list[str]:
-    """A sentence for each score that some frames do not have."""
+    """A sentence for each score that some frames lack, with the reason."""
     reasons: dict[str, dict[str, list[int]]] = one.scores.get("not_scored", {})
     return [
-        f"No {name}" + (f" of frames {', '.join(map(str, numbers))}" if numbers else "") + f": {reason}."
+        f"No {name}" + (f" for frames {', '.join(map(str, numbers))}" if numbers else "") + f": {reason}."
         for name, by_reason in reasons.items()
         for reason, numbers in by_reason.items()
     ]
 
 
 def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, tuple[str, bytes]]) -> str:
-    """One HTML file with all pictures in it, which loads nothing but videos that are too large for it."""
+    """One HTML file that holds all tables, pictures and videos, and loads no other file."""
     runs = []
     for one in reported:
-        video = None
-        if one.video is not None:
-            small = len(one.video) <= LARGEST_EMBEDDED_VIDEO
-            video = _data_uri("video/mp4", one.video) if small else f"{one.prefix}video.mp4"
         runs.append(
             {
                 "title": one.name,
                 "picture": one.picture and _data_uri("image/png", one.picture[1]),
                 "captions": one.captions,
                 "notes": [*one.notes, *_not_scored(one)],
-                "video": video,
+                "video": one.video and _data_uri("video/mp4", one.video),
                 "video_note": one.video_note,
             }
         )
@@ -436,7 +428,7 @@ def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[
 
 
 def _markdown(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, str]) -> str:
-    """The same in Markdown, with links to the files."""
+    """The contents of the page in Markdown, with links to the files."""
     parts = [f"# {_title(reported)}"]
     for table in tables:
         parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]

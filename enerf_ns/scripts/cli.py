@@ -1,4 +1,4 @@
-"""The `enerf` command: the list of commands, of which one alone is imported."""
+"""The `enerf` command. It imports only the module of the command that is called."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from enerf_ns.dataparsers.recording.errors import exit_with_a_sentence, printabl
 from enerf_ns.quiet import silence_known_warnings
 
 COMMANDS = {
-    "bench": ("Bench", "tables of the paper, and the method's own"),
-    "check-numerics": ("CheckNumerics", "check that numbers hold at the extremes"),
-    "convert": ("Convert", "write a recording or event file in the layout of this package"),
-    "demo": ("Demo", "from nothing to a report with a video, in five minutes"),
-    "export": ("Export", "meshes and point clouds, in metres and in the axes of the recording"),
-    "inspect": ("Inspect", "look at a recording before training on it"),
+    "bench": ("Bench", "train and score the rows of a table, such as those of the paper"),
+    "check-numerics": ("CheckNumerics", "check the numerical errors of extreme cases"),
+    "convert": ("Convert", "write a recording or an event file in the format of this package"),
+    "demo": ("Demo", "simulate, train, and report with a video, in five minutes"),
+    "export": ("Export", "write a mesh, a point cloud or the refined poses of a run"),
+    "inspect": ("Inspect", "check a recording before training on it"),
     "reconstruct": ("Reconstruct", "reconstruct frames from the events of a recording"),
-    "report": ("Report", "scores, error against time, pictures and videos of runs"),
-    "simulate": ("Simulate", "events of a scene, a mesh, a video or a trained run"),
+    "report": ("Report", "show scores, error against time, pictures and videos of runs"),
+    "simulate": ("Simulate", "simulate the events of a scene, a mesh, a video or a trained run"),
 }
-"""By name, the class of the command, whose module is named like it, and what it does."""
+"""Class and one-line help of each command. The module has the name of the command."""
 
 
 def entrypoint() -> None:
-    """Run the command line; a user's mistake ends it with one sentence."""
+    """Runs the command line. A mistake of the user ends it with one sentence."""
     silence_known_warnings()
     name, arguments = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
     if name in ("-h", "--help"):
@@ -47,12 +47,15 @@ def _print_help() -> None:
     print("usage: enerf [--help] [--version] COMMAND ...\n\nRadiance fields from event cameras.\n")
     for name, (_, what) in COMMANDS.items():
         print(f"  {name:16}{what}")
-    print("\nenerf COMMAND --help tells the flags of a command; ns-train enerf trains.")
+    print("\nenerf COMMAND --help lists the flags of a command. ns-train enerf trains.")
 
 
 def _imported(name: str) -> type:
-    """The class of a command. SIGINT, unless it is ignored, ends the program meanwhile: libraries make other errors of
-    a KeyboardInterrupt while they are imported."""
+    """The class of a command.
+
+    SIGINT, unless it is ignored, ends the program during the import, because some libraries turn a KeyboardInterrupt
+    into other errors while they are imported.
+    """
     heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:
         signal.signal(signal.SIGINT, _stop)

@@ -1,4 +1,4 @@
-"""`enerf convert`: a recording of any format, or an event file of a camera's maker, in the layout event_recording."""
+"""`enerf convert`: write a recording of any format, or an event file, in the layout event_recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
 @dataclass
 class Convert:
-    """Write a recording, or an event file (Prophesee RAW and DAT, AEDAT4), as a folder in this project's own layout."""
+    """Write a recording, or an event file (Prophesee RAW and DAT, AEDAT4), in the format event_recording."""
 
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of a recording in any known format, or event file: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4."""
@@ -24,14 +24,15 @@ class Convert:
     """New folder for the recording."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
     run: Path | None = None
-    """Run that was trained on the recording, or its config.yml: the new recording has the poses, clocks and lens that
-    it refined."""
+    """Folder or config.yml of a run that was trained on the recording. The new recording has the poses, clocks and
+    lens parameters that this run refined. Default: the recording's own."""
     poses: Path | None = None
-    """For an event file: lines t px py pz qx qy qz qw, on the clock of the file; camera to world, OpenCV axes."""
+    """For an event file: text file of poses, camera to world in OpenCV axes, one line t px py pz qx qy qz qw each. The
+    times are on the clock of the event file."""
     poses_unit: Literal["s", "us", "ns"] = "s"
-    """Unit of the times in --poses."""
+    """Unit of the times in the file of --poses."""
     camera: Path | None = None
-    """For an event file: a JSON file with width, height, model, fx, fy, cx, cy and distortion."""
+    """For an event file: JSON file of the camera with width, height, model, fx, fy, cx, cy and distortion."""
 
     def main(self) -> None:
         source, output_dir = absolute(self.source), absolute(self.output_dir)
@@ -60,7 +61,7 @@ class Convert:
         print(printable(f"The recording is in {output_dir}"))
 
     def _convert_refined(self, run: Path, source: Path, output_dir: Path) -> list[str]:
-        """Writes the recording with the poses that a run refined."""
+        """Writes the recording with the poses that a run refined, and returns sentences about it."""
         from enerf_ns.report.run_files import refined_recording  # here, since Nerfstudio takes seconds
 
         refined = refined_recording(run, source)

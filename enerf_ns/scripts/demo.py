@@ -1,4 +1,4 @@
-"""`enerf demo`: from nothing to a novel-view video."""
+"""`enerf demo`: simulate, train, score and report."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from enerf_ns.dataparsers.recording.files import absolute
 
 @dataclass
 class Demo:
-    """Simulate an event camera, train on its events alone, score the field, write a report."""
+    """Simulate an event camera, train on its events alone, score the field, and write a report."""
 
     output_dir: Path = Path("outputs/demo")
-    """Folder for the recording, the run, and its report."""
+    """Folder for the recording, the run and the report."""
     max_num_iterations: int | None = None
-    """Training steps. None: as many as the method enerf takes."""
+    """Number of training steps. Default: that of the method enerf."""
 
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE

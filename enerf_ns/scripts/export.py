@@ -1,9 +1,9 @@
-"""`enerf export`: meshes, points and refined poses of trained runs, in metres and in the axes of the recording."""
+"""`enerf export`: mesh, point cloud or refined poses of a run, in metres and in the axes of the recording."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional  # tyro reads these annotations on Python 3.10
 
@@ -21,30 +21,32 @@ SUFFIXES = (".ply", ".glb")
 POSE_SUFFIXES = (".txt",)
 
 VOXEL_PIXELS = 1.5
-"""Side of a voxel, in pixels on the median of what is known."""
+"""Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
 
 
 @dataclass
 class Export:
-    """Make a mesh or a point cloud of what a run knows, or write its poses, in metres and in the axes of the recording.
+    """Write a mesh, a point cloud or the refined poses of a run, in metres and in the axes of the recording.
 
-    What no camera saw, or no event told of, stays empty. Where the recording was simulated, or a reference is given,
-    it is scored, and the scores are written beside it.
+    Regions that no camera saw, or whose depth the events do not determine, stay empty. If the recording was simulated,
+    or a reference is given, the mesh or cloud is compared with it, and the scores are written into a .json file.
 
-    Poses are those of the camera of the events, as training refined them: a line t px py pz qx qy qz qw each (TUM), on
-    the clock of the events, camera to world, OpenCV axes. The lens is written beside them.
+    Poses are those of the event camera after training, camera to world in OpenCV axes, on the clock of the events. The
+    file has one line t px py pz qx qy qz qw for each pose (TUM format). A .json file beside it holds the lens.
     """
 
     what: Annotated[Literal["mesh", "pointcloud", "poses"], tyro.conf.Positional]
-    """A mesh, points, or poses."""
+    """Output: a mesh, a point cloud or poses."""
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run, or its config.yml."""
     output: Optional[Path] = None  # noqa: UP045
-    """File to be written: .ply or .glb (glTF), of poses .txt. None: in the folder of the run."""
+    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .txt for poses. Default: mesh.ply, pointcloud.ply
+    or poses.txt in the folder of the run."""
     voxel: Optional[float] = None  # noqa: UP045
-    """Side of a voxel within which depth is averaged, in metres. None: 1.5 pixels on the median of what is known."""
+    """Side in metres of the voxels in which depth is averaged. Default: 1.5 pixels at the median known depth."""
     reference: Optional[Path] = None  # noqa: UP045
-    """Mesh that the result is scored against, in metres, in the axes of the recording. None: the simulated scene."""
+    """Mesh to compare the result with, in metres and in the axes of the recording. Default: the simulated scene, if the
+    recording was simulated."""
 
     def main(self) -> None:
         from enerf_ns.export.scoring import simulated_scene, surface_scores
@@ -93,13 +95,10 @@ class Export:
         lines.append(f"{len(surface.vertices):,} points, {size} m, voxels of {voxel:.3g} m: {output}")
         if scene is not None:
             scores = surface_scores(surface, scene, camera, [view.pose for view in views])
-            table = {"reference": str(self.reference or path), "voxel": voxel, **scores.as_dict()}
+            table = {"reference": str(self.reference or path), "voxel": voxel, **asdict(scores)}
             written[f"{output.stem}.json"] = (json.dumps(table, indent=2) + "\n").encode()
             lines.append(str(scores))
-        try:
-            write_together(output.parent, written)
-        except OSError as error:
-            raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
+        _write(output, written)
         for line in [*(f"note: {note}" for note in notes), *lines]:
             print(printable(line))
 
@@ -110,17 +109,21 @@ class Export:
         recording, refiner = pipeline.datamanager.recording, pipeline.poses
         found = [] if refiner is None else findings(refiner, pipeline.datamanager.distance)
         camera = {**camera_json(recording.camera), "corrections": [row.as_dict() for row in found]}
-        try:
-            write_together(
-                output.parent,
-                {
-                    output.name: encode_tum(recording.trajectory),
-                    f"{output.stem}.json": (json.dumps(camera, indent=2) + "\n").encode(),
-                },
-            )
-        except OSError as error:
-            raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error
+        about = (json.dumps(camera, indent=2) + "\n").encode()
+        _write(output, {output.name: encode_tum(recording.trajectory), f"{output.stem}.json": about})
         corrected = [f"{row.what}: {row.value}" for row in found if row.is_corrected]
-        for line in corrected or ["Nothing of the poses was found to be wrong; they are those of the recording."]:
+        for line in corrected or ["No error of the poses was found. They are those of the recording."]:
             print(printable(line))
         print(printable(f"{len(recording.trajectory.times):,} poses: {output}"))
+
+
+def _write(output: Path, files: dict[str, bytes]) -> None:
+    """Writes the output and the files beside it.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    try:
+        write_together(output.parent, files)
+    except OSError as error:
+        raise OutputError(f"{output} cannot be written ({error.strerror}); give another --output.") from error

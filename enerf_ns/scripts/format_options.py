@@ -1,4 +1,4 @@
-"""Flags for what may be chosen of a recording, made from the options of all registered formats."""
+"""Flags of the options with which recordings are read, made from all registered formats."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from enerf_ns.dataparsers.recording.errors import FlagError
 
 @dataclass
 class FormatFlags:
-    """What was chosen of a recording; its subclass from `format_flags` has a field for each option of a format."""
+    """Options with which a recording is read. The subclass from `format_flags` has one field for each option."""
 
     def given(self) -> dict[str, Any]:
-        """The options that are set, by name, as `read_recording` takes them."""
+        """The options that the user gave, by name, as arguments of `read_recording`."""
         chosen = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in chosen.items() if value is not None}
 
 
 def format_flags() -> type[FormatFlags]:
-    """A dataclass for tyro with the options of all formats that are registered by now, each None unless given."""
+    """A dataclass for tyro with the options of all registered formats. Each is None unless the user gives it."""
     types: dict[str, Any] = {}
     helps: dict[str, list[str]] = {}
     for format in formats():
         hints, about = get_type_hints(format.options), _docstrings(format.options)
         for option in fields(format.options):
             types[option.name] = Optional[hints[option.name]] | types.get(option.name)  # noqa: UP045
-            sentence = f"For a recording of {format.name}: {about.get(option.name, '')} None: {option.default}."
+            sentence = f"For a recording of {format.name}: {about.get(option.name, '')} Default: {option.default}."
             helps.setdefault(option.name, []).append(sentence)
     flags = [
         (name, Annotated[types[name], tyro.conf.arg(help=" ".join(sentences))], None)
@@ -44,7 +44,7 @@ def format_flags() -> type[FormatFlags]:
 
 
 def _docstrings(options: type) -> dict[str, str]:
-    """The strings below the fields of a class, by field; none where its source is not at hand."""
+    """The docstrings of the fields of a class, by field. Empty if the source cannot be read."""
     try:
         source = textwrap.dedent(inspect.getsource(options))
     except OSError:
@@ -62,13 +62,13 @@ def _docstrings(options: type) -> dict[str, str]:
 
 
 def refuse_beside_run(chosen: Iterable[str]) -> None:
-    """Says that a run knows how its recording is read.
+    """Refuses options of a recording beside --run, because the run knows how its recording is read.
 
     Args:
-        chosen: Names of the options that were given.
+        chosen: Names of the options that the user gave.
 
     Raises:
-        FlagError: There are some.
+        FlagError: The user gave an option.
     """
     for option in chosen:
         raise FlagError(f"--{option.replace('_', '-')} is taken from the run of --run; leave it out.")

@@ -1,4 +1,4 @@
-"""`enerf inspect`: what a recording holds and what is wrong with it, in the terminal and as a page of pictures."""
+"""`enerf inspect`: contents and problems of a recording, in the terminal and as a page of pictures."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ CONSOLE = Console(width=120)
 
 @dataclass
 class Inspect:
-    """Look at a recording before training: what was found, numbers, problems, and a page of pictures."""
+    """Check a recording before training: print its contents and problems, and write a page of pictures."""
 
     data: Annotated[Path, tyro.conf.Positional]
-    """Folder of the recording. It is only ever read."""
+    """Folder of the recording. Nothing is written into it."""
     output: Path | None = None
-    """HTML file for the pictures. None: inspect-NAME.html in the current folder, with the name of the recording."""
+    """HTML file for the pictures. Default: inspect-NAME.html in the current folder, where NAME is the recording's."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
     run: Path | None = None
-    """Run that was trained on the recording, or its config.yml: clock, poses and lens are taken as it refined them, and
-    shown beside what was stated."""
+    """Folder or config.yml of a run that was trained on the recording. Clock, poses and lens are those that this run
+    refined, and the page compares them with the recording's own. Default: the recording's own alone."""
 
     def main(self) -> None:
         data = absolute(self.data)
@@ -47,7 +47,11 @@ class Inspect:
 
             recording = refined_recording(self.run, data)
             if recording.as_read is None:
-                print(printable(f"{self.run} found nothing wrong with clock, poses and lens; they are as stated."))
+                print(
+                    printable(
+                        f"{self.run} corrected neither clock nor poses nor lens; they are those of the recording."
+                    )
+                )
             corrections = corrections_over_time(recording)
         inspection = Inspection.of(recording)
         inspection.print_tables(CONSOLE)

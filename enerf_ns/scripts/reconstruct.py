@@ -1,4 +1,4 @@
-"""`enerf reconstruct`: writes a recording with frames that a network or a filter reconstructs from its events."""
+"""`enerf reconstruct`: write a recording with frames that a network or a filter reconstructs from its events."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ from enerf_ns.scripts.format_options import format_flags
 
 @dataclass
 class Reconstruct:
-    """Write a recording with frames reconstructed from its events, for training, in this package's own layout."""
+    """Reconstruct frames from the events of a recording, and write a recording with these frames to train on."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder of a recording in any known format. It is only read."""
+    """Folder of a recording in any known format. Nothing is written into it."""
     output_dir: Path
-    """New folder for the recording. It also gets the frames of the source, for evaluation."""
+    """New folder for the recording. It keeps the original frames for evaluation."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
     weights: Path | None = None
     """Published checkpoint of E2VID or FireNet. Default: a complementary filter, which needs no checkpoint."""
     cutoff_frequency: float | None = None
-    """Cut-off frequency of the complementary filter in Hz. The filter forgets slower changes. Default: 0.5."""
+    """Cut-off frequency of the complementary filter in Hz: it forgets brightness that changes more slowly.
+    Default: 0.5."""
     frames_per_second: float | None = None
-    """Frame rate for a recording without frames. Default: 30. In a recording with frames, their times are used."""
+    """Number of frames per second, for a recording without frames. Default: 30. In a recording with frames, they are
+    reconstructed at the times of these frames."""
 
     def main(self) -> None:
         source, output_dir = absolute(self.source), absolute(self.output_dir)

@@ -1,4 +1,4 @@
-"""`enerf report`: error against time, scores, pictures and videos of runs."""
+"""`enerf report`: scores, error against time, pictures and videos of runs."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from enerf_ns.report.scoring import Scoring
 
 @dataclass
 class Report:
-    """Scores, error against time, pictures and videos of runs, on one page.
+    """Write scores, error against training time, pictures and videos of runs on one page.
 
-    Of runs that are still going or crashed, and of those whose recording is gone, whatever there is.
+    Runs that are still training, runs that crashed, and runs whose recording is gone are reported as far as possible.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, or above runs, or files config.yml."""
+    """Folders of runs, folders that hold runs, or files config.yml."""
     output_dir: Optional[Path] = None  # noqa: UP045
-    """Folder for the report. None: that of the run; of several, ./report."""
+    """Folder for the report. Default: the folder of the run, or ./report for several runs."""
     reach: Optional[tuple[float, ...]] = None  # noqa: UP045
-    """PSNR in dB whose training time is told. None: some that the runs reach."""
+    """Values of PSNR in dB. The report says after how much training each run reaches them. Default: up to four values
+    that a run reaches."""
     video: bool = True
-    """Render a flight past the held-out cameras."""
+    """Render video.mp4, a flight past the held-out cameras, and moving.webp, the recorded path."""
     scoring: Annotated[Scoring, tyro.conf.arg(name="")] = field(default_factory=Scoring)
-    """How held-out frames are scored; what is not the default is scored anew."""
+    """Scoring of held-out frames. With other values than the defaults, all held-out frames are rendered again."""
 
     def main(self) -> None:
         from nerfstudio.utils.rich_utils import CONSOLE

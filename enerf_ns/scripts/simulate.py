@@ -1,5 +1,7 @@
-"""`enerf simulate`: simulates a recording of an event camera, with frames, depth and poses, from scenes drawn by a
-seed, meshes, folders of images, videos, or trained runs."""
+"""`enerf simulate`: simulate a recording of an event camera, with frames, depth and poses.
+
+The source is a scene that is made from a seed, a mesh, a folder of images, a video or a trained run.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,15 @@ from enerf_ns.simulator.settings import SimulationSettings
 
 @dataclass
 class Simulate:
-    """Simulate a recording of an event camera, with sharp and blurred frames, depth and poses."""
+    """Simulate a recording of an event camera with sharp and blurred frames, depth and poses."""
 
     output_dir: Path
     """New folder for the recording."""
     settings: Annotated[SimulationSettings, tyro.conf.arg(name="")] = field(default_factory=SimulationSettings)
     log_eps: Optional[float] = None  # noqa: UP045
-    """Short form of --response logarithm:EPS."""
+    """EPS in --response logarithm:EPS, as a flag of its own."""
     preview: bool = False
-    """Write the video preview.mp4 too: frame, blurred frame, events and depth side by side."""
+    """Also write preview.mp4, which shows frame, blurred frame, events and depth side by side."""
 
     def main(self) -> None:
         settings = self.settings
@@ -46,6 +48,6 @@ class Simulate:
         ]
         if made.has_poses and made.num_events:
             folder = quoted(made.folder)
-            lines += [f"look at it: enerf inspect {folder}", f"train: ns-train enerf --data {folder}"]
+            lines += [f"check it: enerf inspect {folder}", f"train: ns-train enerf --data {folder}"]
         for line in lines:
             print(printable(line))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from enerf_ns.bench.tables import changes_since, changes_table, csv_table, disagreements, markdown, rich_table
+from enerf_ns.bench.tables import changes_since, changes_table, csv_table, disagreements, markdown, scores_table
 
 
 def run(row: str, psnr: float | None, sequence: str = "shake", seed: int = 0, **changes: Any) -> dict[str, Any]:
@@ -163,7 +163,7 @@ def test_the_terminal_shows_the_cells_of_the_markdown():
     told = results(run("events", 25.0), run("frames", 26.0))
     console = Console(width=200)
     with console.capture() as shown:
-        console.print(rich_table(told))
+        console.print(scores_table(told).rich())
     for line in rows_of(markdown(told)):
         assert any(all(cell in printed for cell in line) for printed in shown.get().splitlines())
 
@@ -196,6 +196,6 @@ def test_what_became_of_each_row_since_another_version_stands_worst_first():
     assert [change.loses for change in changes] == [True, False]
     assert not changes_since(results(run("events", 25.71)), before)[0].loses, "less than 0.3 dB may be lost"
     console = Console(width=140, record=True)
-    console.print(changes_table(changes, "before.json"))
+    console.print(changes_table(changes, "before.json").rich())
     told = console.export_text()
     assert told.count("more than 0.3 dB lost") == 1 and "-0.35" in told and "+5.00" in told

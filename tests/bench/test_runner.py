@@ -377,8 +377,16 @@ def test_seconds_become_as_many_steps_as_fit(finished: Path, tmp_path: Path, mon
     ("name", "changes", "sentence"),
     [
         ("nothing", {}, "There is no experiment nothing; choose one of spiral, "),
-        ("design", {"rows": ("events", "nothing")}, "--rows nothing is not of this experiment; choose of events, "),
-        ("design", {"sequences": ("spiral1",)}, "--sequences spiral1 is not of this experiment; choose of shapes"),
+        (
+            "design",
+            {"rows": ("events", "nothing")},
+            "--rows nothing is not part of this experiment; choose from",
+        ),
+        (
+            "design",
+            {"sequences": ("spiral1",)},
+            "--sequences spiral1 is not part of this experiment; choose from",
+        ),
         ("shake", {"data": Path("x")}, "--data changes nothing for shake"),
         ("eds", {}, "enerf bench eds needs --data"),
         ("design", {"scale": 0.0}, "--scale is 0"),

@@ -40,8 +40,8 @@ def test_constant_pictures_have_scores_but_no_correlation(values: tuple[float, f
     constant = [torch.full((12, 16, 3), value) for value in values]
     found: Any = ssim(*constant)
     assert np.isfinite(found)
-    assert correlation(*constant) == correlation(constant[0], pictures(1)[0]) == "what is rendered is flat"
-    assert correlation(pictures(1)[0], constant[1]) == "what is recorded is flat"
+    assert correlation(*constant) == correlation(constant[0], pictures(1)[0]) == "the rendered values are all equal"
+    assert correlation(pictures(1)[0], constant[1]) == "the recorded values are all equal"
     assert psnr(*constant) == pytest.approx(120.0 if values[0] == values[1] else -20 * np.log10(values[1] - values[0]))
 
 
@@ -74,7 +74,7 @@ def test_scores_of_events_are_those_of_a_loop():
 def test_changes_that_are_flat_or_not_finite_have_the_scores_that_they_can_have():
     measured = torch.tensor([0.2, -0.2, 0.4])
     flat = event_scores(torch.zeros(3), measured, 0.2)
-    assert flat["event_correlation"] == "what is rendered is flat" and flat["event_sign"] == 0.0
+    assert flat["event_correlation"] == "the rendered values are all equal" and flat["event_sign"] == 0.0
     assert flat["event_rmse"] == pytest.approx(np.sqrt(2.0))
     spoilt = event_scores(torch.tensor([0.1, torch.nan, 0.1]), measured, 0.2)
     assert set(spoilt.values()) == {"the render is not finite"}

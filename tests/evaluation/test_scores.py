@@ -164,7 +164,7 @@ def test_a_summary_has_a_place_for_what_is_missing():
     table = summary_scores(nothing, {"event_correlation": 0.5})
     empty["protocol"] = "events"
     assert table == {**empty, "event_correlation": 0.5, "not_scored": reasons}
-    flat = "what is rendered is flat"
+    flat = "the rendered values are all equal"
     table = summary_scores(nothing, {"event_correlation": flat})
     assert table == {**empty, "not_scored": {**reasons, "event_correlation": {flat: []}}}
 

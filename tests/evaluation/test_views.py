@@ -174,7 +174,7 @@ def test_one_render_that_is_not_finite_is_left_as_it_is_and_the_others_are_align
 def test_a_negative_and_what_is_flat_is_shown_as_it_is_and_why(shown: Any):
     for change, reason in (
         (lambda rgb: 1.2 - rgb, "the render is a negative of the frame (brightness scale -"),
-        (lambda rgb: 0.0 * rgb, "no brightness fits, since what is rendered or recorded is flat"),
+        (lambda rgb: 0.0 * rgb, "no correction of brightness can be fitted, since the render or the frame is flat"),
     ):
         views = [replace(view, rendered=change(view.rendered)) for view in held_out_views(shown)[0]]
         aligned, parameters = aligned_views(views)

@@ -78,7 +78,7 @@ def test_depth_that_is_not_known_is_pale(run: Run):
     opacity = np.asarray(depth.get_alpha())
     assert (opacity[confidence[..., 0].numpy() >= KNOWN] == 1).all() and opacity[0, 0] < 0.3
     assert (np.diff(opacity.ravel()) >= 0).all()
-    assert "not known" in "".join(axis.get_xlabel() for axis in figure.findobj(Axes) if isinstance(axis, Axes))
+    assert "uncertain" in "".join(axis.get_xlabel() for axis in figure.findobj(Axes) if isinstance(axis, Axes))
 
 
 def test_brightness_is_shown_to_a_power_and_nothing_else_is(run: Run):

@@ -45,7 +45,7 @@ def history(final: bool = True, better: float = 0.0) -> list[HistoryRow]:
     return [
         HistoryRow(
             2**n, 2.0**n, {"event_loss": 1 / 2**n}, {"psnr": 10 + 2 * n + better, "depth_rmse": 1 - n / 10}, 3, PARTS,
-            final and n == 4,
+            final and n == 4, protocol="log-affine-set",
         )
         for n in range(5)
     ]  # fmt: skip
@@ -132,7 +132,7 @@ def without_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_path: Path, monkeypatch):
-    """As runs of earlier versions are; the film itself is another test's."""
+    """As with --evaluation-share 0; the film itself is tested elsewhere."""
     without_rendering(monkeypatch)
     folder = tmp_path / "new" / "report"
     entries = write_report([run], folder)
@@ -183,13 +183,6 @@ def test_the_brightness_scale_stands_beside_what_it_should_be(
     assert ("The brightness scale is the factor" in text) == (cell is not None)
 
 
-def test_a_large_video_is_beside_the_page(run: Run, tmp_path: Path, monkeypatch):
-    without_rendering(monkeypatch)
-    monkeypatch.setattr(writing, "LARGEST_EMBEDDED_VIDEO", 3)
-    write_report([run], tmp_path)
-    assert Page((tmp_path / "report.html").read_text()).sources[-1] == "video.mp4"
-
-
 def test_a_run_without_frames_is_scored_by_its_events(run_without_frames: Run, tmp_path: Path):
     (scores,) = write_report([run_without_frames], tmp_path, video=False).values()
     assert [scores[name] for name in ("psnr", "ssim", "lpips")] == [None] * 3
@@ -228,7 +221,9 @@ def test_a_crashed_run_shows_its_history_up_to_the_line_that_is_whole(crashed: P
     assert "No whole checkpoint is stored" in (tmp_path / "report/report.md").read_text()
 
 
-@pytest.mark.parametrize("rows", [[], [HistoryRow(1, 0.5)], [HistoryRow(0, 0.0, scores={"psnr": 5.0})], history()[:1]])
+@pytest.mark.parametrize(
+    "rows", [[], [HistoryRow(1, 0.5)], [HistoryRow(0, 0.0, scores={"psnr": 5.0}, protocol="raw")], history()[:1]]
+)
 def test_a_run_of_no_step_or_one_has_a_report(run: Run, tmp_path: Path, rows: list[HistoryRow]):
     folder = copied(run, tmp_path / "begun", rows, stored=False, max_num_iterations=50)
     (scores,) = write_report([folder], tmp_path / "report").values()
@@ -444,22 +439,13 @@ def test_the_end_of_a_run_is_told_by_its_history_as_by_its_checkpoint(
 
 
 @pytest.mark.parametrize(
-    ("row", "supervision", "protocol"),
+    ("row", "protocol"),
     [
-        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3, protocol="gamma-affine"), "events", "gamma-affine"),
-        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "events", "log-affine-set"),
-        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "events+frames", "log-affine-set"),
-        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3), "frames", "raw"),
-        (HistoryRow(2, 1.0, {}, {"event_correlation": 0.5}), "events", "events"),
+        (HistoryRow(2, 1.0, {}, {"psnr": 9.0}, 3, protocol="gamma-affine"), "gamma-affine"),
+        (HistoryRow(2, 1.0, {}, {"event_correlation": 0.5}, protocol="events"), "events"),
     ],
 )
-def test_a_row_says_how_it_is_scored_or_is_of_an_earlier_version(
-    run: Run, tmp_path: Path, row: HistoryRow, supervision: str, protocol: str
-):
+def test_a_row_says_how_it_is_scored(run: Run, tmp_path: Path, row: HistoryRow, protocol: str):
     folder = copied(run, tmp_path / "run", [row], stored=False)
-    file = folder / "config.yml"
-    config = yaml.load(file.read_text(), Loader=yaml.Loader)
-    config.pipeline.datamanager.supervision = supervision
-    file.write_text(yaml.dump(config))
     (entry,) = write_report([folder], tmp_path / "report").values()
     assert entry["protocol"] == protocol and described(protocol) in (tmp_path / "report" / "report.md").read_text()

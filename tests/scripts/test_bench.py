@@ -49,6 +49,6 @@ def test_each_training_the_table_and_where_it_lies_are_printed(call, tmp_path: P
 
 
 def test_a_mistake_is_told_in_one_sentence(call, tmp_path: Path):
-    with pytest.raises(SystemExit, match=r"^enerf: --budget is 2m, but seconds, as in 120s, or steps"):
+    with pytest.raises(SystemExit, match=r"^enerf: --budget is 2m, but must be seconds, such as 120s, or steps"):
         call("design", "--budget", "2m", "--output-dir", str(tmp_path))
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Brightness, thresholds and losses: the knee of linlog, the dark, changes of nothing."""
+"""Cases of brightness, thresholds and losses: the knee of linlog, darkness, zero changes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def darkness() -> float:
     return wrong
 
 
-@case("log brightness from 0 to 80", "brightness and back, as a share, in float32", 2e-5)
+@case("log brightness from 0 to 80", "relative error after inverting the response, in float32", 2e-5)
 def back_again() -> float:
     responses: tuple[Response, ...] = (Linlog(), Logarithm(0.001), Logarithm(1.0), Gamma(2.2, 1e-5))
     values = torch.linspace(0.01, 80.0, 4001)

@@ -1,14 +1,16 @@
-"""Extreme cases, each with what is expected, and how far from it the package may be."""
+"""Extreme cases with their expected results and bounds of their errors."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from enerf_ns.report.tables import Table
 
 Measure = Callable[[], float]
-"""Computes the error of a case: its distance from a closed form or float64, or how many things went wrong."""
+"""Computes the error of a case: a distance from a closed form or float64, or the number of faults."""
 
 
 @dataclass(frozen=True)
@@ -17,42 +19,43 @@ class Case:
 
     name: str
     expected: str
-    """What is expected, in words."""
+    """Expected result, in words."""
     bound: float
     """Largest error that passes."""
     unit: str
-    """Of the error and its bound."""
+    """Unit of the error and its bound."""
     measure: Measure
 
 
 @dataclass(frozen=True)
 class Result:
-    """What was measured of a case."""
+    """The outcome of one case."""
 
-    name: str
-    expected: str
+    case: Case
     error: float | None
-    """Error; None where the case could not be computed."""
-    bound: float
-    unit: str
-    passed: bool
+    """None: the case raised an error."""
+    failure: str
+    """The error that the case raised."""
     seconds: float
-    failure: str = ""
-    """Why the case could not be computed."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is a number within the bound."""
+        return self.error is not None and self.error <= self.case.bound
 
 
 CASES: list[Case] = []
-"""All cases of the modules that are imported; `enerf_ns.bench.numerics.all_cases` imports all."""
+"""Cases of all imported modules. `enerf_ns.bench.numerics.all_cases` imports all modules."""
 
 
 def case(name: str, expected: str, bound: float = 0.0, unit: str = "") -> Callable[[Measure], Measure]:
-    """Makes a case of the function that computes its error.
+    """Returns a decorator that registers a function as the measure of a case.
 
     Args:
-        name: What is extreme.
-        expected: What is expected, in words.
+        name: Name of the case.
+        expected: Expected result, in words.
         bound: Largest error that passes.
-        unit: Of the error.
+        unit: Unit of the error.
     """
 
     def register(measure: Measure) -> Measure:
@@ -63,33 +66,36 @@ def case(name: str, expected: str, bound: float = 0.0, unit: str = "") -> Callab
 
 
 def run(case: Case) -> Result:
-    """Computes a case. One that raises, or whose error is not a number, has not passed."""
+    """Computes a case. A case that raises an error, or whose error is NaN, does not pass."""
     start = time.perf_counter()
     error, failure = None, ""
     try:
         error = float(case.measure())
-    except Exception as raised:  # whatever it is, it is the result
+    except Exception as raised:  # any error is a result
         failure = f"{type(raised).__name__}: {raised}"
-    passed = error is not None and error <= case.bound
-    seconds = time.perf_counter() - start
-    return Result(case.name, case.expected, error, case.bound, case.unit, passed, seconds, failure)
+    return Result(case, error, failure, time.perf_counter() - start)
 
 
-def as_markdown(results: list[Result]) -> str:
-    """A table with a line for each case."""
-    return "\n".join(["| case | expected | error | at most | |", "|---|---|---|---|---|", *_lines(results)]) + "\n"
+def as_table(results: list[Result]) -> Table:
+    """A table with a row for each case."""
+    rows = []
+    for result in results:
+        case = result.case
+        error = result.failure if result.error is None else shown(result.error, case.unit)
+        verdict = "pass" if result.passed else "FAIL"
+        rows.append([case.name, case.expected, error, shown(case.bound, case.unit), verdict])
+    note = f"{len(results)} cases, {sum(result.seconds for result in results):.0f} s"
+    return Table("Numbers at the extremes", ["case", "expected", "error", "at most", "result"], rows, note, 5)
 
 
 def as_json(results: list[Result]) -> str:
     """The results as a list of objects."""
-    return json.dumps([asdict(result) for result in results], indent=2) + "\n"
-
-
-def _lines(results: list[Result]) -> Iterator[str]:
-    for result in results:
-        error = shown(result.error, result.unit) if result.error is not None else result.failure
-        bound, verdict = shown(result.bound, result.unit), "pass" if result.passed else "**fail**"
-        yield f"| {result.name} | {result.expected} | {error} | {bound} | {verdict} |"
+    objects = [
+        {"name": result.case.name, "expected": result.case.expected, "error": result.error, "bound": result.case.bound,
+         "unit": result.case.unit, "passed": result.passed, "seconds": result.seconds, "failure": result.failure}
+        for result in results
+    ]  # fmt: skip
+    return json.dumps(objects, indent=2) + "\n"
 
 
 def shown(value: float, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""Drawing pairs: bursts at one pixel, equal stamps, clocks that show any time."""
+"""Cases of sampling event pairs: bursts at one pixel, equal timestamps, offsets of the clock."""
 
 from __future__ import annotations
 
@@ -25,21 +25,29 @@ def _index(pixels: np.ndarray, times: np.ndarray) -> EventIndex:
 
 
 def _burst() -> EventIndex:
-    """10,000 events within a millisecond at one pixel, beside pixels with two, a second apart."""
+    """10,000 events within a millisecond at one pixel, and eight pixels with two events a second apart."""
     pixels = np.concatenate([np.zeros(10_000, np.int64), np.repeat(np.arange(1, 9), 2)])
     times = np.concatenate([500_000_000 + 100 * np.arange(10_000), np.tile([0, 10**9], 8)])
     return _index(pixels, times)
 
 
 @case(
-    "10,000 events in a millisecond at one pixel beside pixels with two", "as many pairs as a loop counts", 0, "pairs"
+    "10,000 events in a millisecond at one pixel beside pixels with two",
+    "the number of pairs that a loop counts",
+    0,
+    "pairs",
 )
 def burst_pairs() -> float:
     counted = sum(min(10_000 - 1 - i, 10) for i in range(10_000)) + 8
     return abs(EventPairSampler(_burst(), "partner", max_distance=10).num_pairs - counted)
 
 
-@case("the same, each pixel alike", "every ninth pair at each pixel, in standard deviations", 5.0, "σ")
+@case(
+    "the same burst, pixels drawn with equal probability",
+    "one pair of nine at each pixel, in standard deviations",
+    5.0,
+    "σ",
+)
 def burst_pixels() -> float:
     sampler = EventPairSampler(_burst(), "partner", max_distance=10, uniform_over="pixels")
     drawn = sampler.sample(DRAWN, torch.Generator().manual_seed(0)).pixels
@@ -47,7 +55,7 @@ def burst_pixels() -> float:
     return np.abs((counts - DRAWN / 9) / np.sqrt(DRAWN * 8 / 81)).max()
 
 
-@case("the same, silent pixels", "no event within a silent pair", 0, "events")
+@case("the same burst, silent pairs", "no event between the instants of a silent pair", 0, "events")
 def burst_silence() -> float:
     index, generator = _burst(), torch.Generator().manual_seed(0)
     within = 0

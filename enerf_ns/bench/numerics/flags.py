@@ -1,4 +1,4 @@
-"""Flags: numbers that are none, or that nobody can mean, are refused before anything starts."""
+"""Cases of flags: values that are NaN or out of range are refused before training starts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SENSOR, MODEL, DATA = "pipeline.model.sensor.", "pipeline.model.", "pipeline.dat
 
 
 def _accepted(*settings: tuple[str, Any]) -> float:
-    """How many settings, each with a value that is none, are accepted."""
+    """Number of invalid settings that are accepted."""
     accepted = 0
     for name, value in settings:
         try:

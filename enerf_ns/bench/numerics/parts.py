@@ -1,9 +1,9 @@
-"""Numerical error of the parts of a trained run, one form for all, so that one sees which part limits a result."""
+"""Numerical errors of the parts of a trained run, to find the part that limits a result."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ from jaxtyping import Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from enerf_ns.bench.numerics.case import shown
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.evaluation.metrics import psnr
@@ -32,28 +31,28 @@ if TYPE_CHECKING:
     from enerf_ns.method.runs import Run
 
 SAMPLES = (8, 16, 32, 64, 128, 256, 512)
-"""Samples a ray whose error is measured."""
+"""Numbers of samples on each ray whose errors are measured."""
 
 CONVERGED = 2048
-"""Even samples along a ray of the render that counts as converged."""
+"""Number of even samples on each ray of the render that counts as converged."""
 
 NUM_RAYS = 1024
-"""Pixels of held-out views, drawn at random, that are rendered again and again."""
+"""Number of random pixels of held-out views that are rendered."""
 
 RAYS_AT_ONCE = 128
-"""Rays that are rendered at a time."""
+"""Number of rays that are rendered at a time."""
 
 NUM_PAIRS = 512
-"""Pairs of events whose changes of log brightness are computed again and again."""
+"""Number of event pairs whose changes of log brightness are computed."""
 
 THINNINGS = (2, 4, 8, 16, 32)
-"""One of so many poses is kept to measure the error of interpolation."""
+"""Factors by which poses are thinned to measure the error of interpolation."""
 
 FEWEST_POSES = 8
-"""Poses that are left at least where a trajectory is thinned."""
+"""Least number of poses of a thinned trajectory."""
 
 NUM_VIEWS = 8
-"""Most held-out views, evenly chosen, over which brightness is fitted."""
+"""Most held-out views, evenly chosen, for the error of the brightness fit."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +60,13 @@ class PartError:
     """Numerical error of one part of a run."""
 
     name: str
-    """The part, and its setting."""
+    """Name of the part with its setting."""
     compared: str
-    """With what it is compared."""
+    """Reference of the comparison."""
     error: float
-    """Root mean square, but for PSNR."""
+    """Root mean square error, or PSNR in dB."""
     unit: str
+    """Unit of the error."""
 
 
 def error_of_parts(run: Run) -> list[PartError]:
@@ -91,21 +91,16 @@ def error_of_parts(run: Run) -> list[PartError]:
     return rows
 
 
-def as_markdown(rows: Sequence[PartError]) -> str:
-    """A table with a line for each row."""
-    lines = [f"| {row.name} | {row.compared} | {shown(row.error, row.unit)} |" for row in rows]
-    return "\n".join(["| part | compared with | error |", "|---|---|---|", *lines]) + "\n"
-
-
 def pose_interpolation(
     trajectory: Trajectory, stretches: Int64[np.ndarray, "stretches 2"], camera: Camera, depth: float
 ) -> list[PartError]:
-    """How far poses between those that are kept are from the ones that are left out, each way of thinning by itself.
+    """Errors of poses that are interpolated between the poses of thinned trajectories.
 
     Args:
-        trajectory: All poses there are.
-        stretches: First and last instant (ns) of what is used of them.
-        camera: At a depth of `depth` metres, points seen over its whole picture move by the pixels that are given.
+        trajectory: All poses.
+        stretches: First and last instant (ns) of each used part of the trajectory.
+        camera: Camera for errors in pixels, as the motion of points in its whole picture.
+        depth: Depth of these points, metres.
     """
     rows = []
     directions = camera.pixel_directions()[:: max(camera.height // 4, 1), :: max(camera.width // 4, 1)].reshape(-1, 3)
@@ -131,7 +126,7 @@ def pose_interpolation(
             (np.degrees(rotation_angles(true[..., :3], found[..., :3])), "degrees"),
             (np.linalg.norm(moved, axis=-1), f"pixels at {depth:.3g} m"),
         ):
-            rows.append(PartError(name, "the poses that are left out", _rms(errors), unit))
+            rows.append(PartError(name, "the omitted poses", _rms(errors), unit))
     return rows
 
 
@@ -159,8 +154,10 @@ def _rendered(model: EnerfModel, rays: RayBundle) -> tuple[Tensor, Tensor]:
 
 @contextmanager
 def _samples(model: EnerfModel, number: int, even: bool) -> Iterator[None]:
-    """Has a model take so many samples a ray: evenly, or as it was trained, with those of its proposal network in the
-    same proportion."""
+    """Changes the number of samples on each ray of a model within the block.
+
+    Samples are even, or placed as in training, where the samples of the proposal network change in proportion.
+    """
     before, proposal = model.sampler, model.proposal
     sampler: Any = copy.copy(before)
     if not isinstance(sampler, PairedProposalSampler):
@@ -180,7 +177,7 @@ def _samples(model: EnerfModel, number: int, even: bool) -> Iterator[None]:
 
 
 def _quadrature(model: EnerfModel, rays: RayBundle) -> tuple[list[PartError], Tensor]:
-    """Errors of fewer samples a ray, and the converged distance along each ray in scene units."""
+    """Errors of fewer samples on each ray, and the converged distance along each ray in scene units."""
     with _samples(model, CONVERGED, even=True):
         converged, distance = _rendered(model, rays)
     trained = model.config.num_samples
@@ -200,7 +197,7 @@ def _quadrature(model: EnerfModel, rays: RayBundle) -> tuple[list[PartError], Te
 
 
 def _brightness_changes(run: Run) -> list[PartError]:
-    """Errors of changes of log brightness between the two instants of event pairs, in thresholds."""
+    """Errors of rendered changes of log brightness of event pairs, in thresholds."""
     manager, model = run.pipeline.datamanager, run.pipeline.model
     sensor = model.sensor
     generator = torch.Generator(run.pipeline.device).manual_seed(0)
@@ -236,7 +233,7 @@ def _brightness_changes(run: Run) -> list[PartError]:
 
 @contextmanager
 def _float64() -> Iterator[None]:
-    """Has tensors that are made from nothing be float64."""
+    """Makes float64 the default type of new tensors within the block."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -246,7 +243,7 @@ def _float64() -> Iterator[None]:
 
 
 def _brightness_fit(run: Run) -> list[PartError]:
-    """What is left after the brightness fit of the default protocol; nothing where there is none."""
+    """Error that remains after the brightness fit of the default protocol; empty if no view has a fit."""
     number = len(run.pipeline.datamanager.eval_dataset)
     chosen = np.unique(np.linspace(0, number - 1, NUM_VIEWS).round().astype(int)).tolist()
     views, _ = aligned_views(held_out_views(run.pipeline, chosen, evidence=False)[0])

@@ -1,4 +1,4 @@
-"""Events of points, in closed form: one whenever the camera sees a point enter another pixel."""
+"""Events of points in closed form: an event occurs whenever a point enters another pixel."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PHASE = 2 * np.pi * np.linspace(0, 1, 2000)[:, None]
 TURNING = Rotation.from_rotvec(
     0.06 * np.concatenate([np.sin(2 * PHASE), np.sin(3 * PHASE + 2), np.sin(PHASE + 4)], axis=1)
 )
-"""A shaking camera's rotations, one each millisecond of two seconds."""
+"""Rotations of a shaking camera, one for each millisecond of two seconds."""
 
 
 def shaking(amplitude: float) -> Float64[np.ndarray, "2000 3"]:
-    """A shaking camera's places, one each millisecond of two seconds.
+    """Positions of a shaking camera in metres, one for each millisecond of two seconds.
 
     Args:
-        amplitude: In metres, along each axis.
+        amplitude: Amplitude along each axis, metres.
     """
     return amplitude * np.concatenate([np.sin(3 * PHASE), np.sin(2 * PHASE + 1), np.sin(2.5 * PHASE + 3)], axis=1)
 
@@ -31,14 +31,17 @@ def shaking(amplitude: float) -> Float64[np.ndarray, "2000 3"]:
 def recording_of_points(
     points: Float64[np.ndarray, "points 3"], positions: Float64[np.ndarray, "poses 3"], rotations: Rotation
 ) -> tuple[Events, Trajectory, Float64[np.ndarray, " events"]]:
-    """Events of points (world, metres), their camera's poses, and the depths at which they were seen.
+    """Simulates the events of points.
 
-    A tenth as many events, which have no depth, are added at random.
+    Random events without depth are added, a tenth of the number of events of points.
 
     Args:
-        points: In the world, metres.
-        positions: Of `CAMERA`, one each millisecond.
-        rotations: Camera to world, one each millisecond.
+        points: Points in world coordinates, metres.
+        positions: Positions of `CAMERA`, metres, one for each millisecond.
+        rotations: Rotations camera to world, one for each millisecond.
+
+    Returns:
+        The events, the trajectory, and the depths in metres of the events of points.
     """
     times = np.arange(len(positions)) * 1_000_000
     seen = np.einsum("tji,tnj->tni", rotations.as_matrix(), points - positions[:, None])
@@ -66,7 +69,7 @@ def points_between(near: float, far: float) -> Float64[np.ndarray, "250 3"]:
 
 
 def noisy(positions: np.ndarray, noise: float, kind: str, seed: int) -> np.ndarray:
-    """Positions with noise of a standard deviation in metres: "white", or a "drift" over a fifth of the recording."""
+    """Positions with noise of a standard deviation in metres: "white", or "drift" over a fifth of the recording."""
     errors = np.random.default_rng(seed).normal(size=positions.shape)
     if kind == "drift":
         errors = gaussian_filter1d(errors, len(errors) / 5, axis=0)

@@ -1,4 +1,4 @@
-"""Times and poses: long and late clocks, half turns, worlds far away."""
+"""Cases of times and poses: long recordings, late clocks, half turns."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from enerf_ns.bench.numerics.case import case
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 EPOCH = 1_600_000_000 * 10**9
-"""A day in 2020 as nanoseconds since 1970."""
+"""A time in 2020, nanoseconds since 1970."""
 
 
 def _poses(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and quaternions of a path that goes on smoothly and turns by up to some radians."""
+    """Positions and quaternions of a random walk, one for each time."""
     generator = np.random.default_rng(0)
     positions = generator.normal(size=(len(times), 3)).cumsum(axis=0)
     rotations = Rotation.from_rotvec(generator.normal(size=(len(times), 3)).cumsum(axis=0))
@@ -23,7 +23,7 @@ def _poses(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _off_scipy(times: np.ndarray) -> float:
-    """Largest difference of poses from SciPy's, whose times are counted from the first pose."""
+    """Largest difference between our poses and SciPy's, whose times start at the first pose."""
     positions, quaternions = _poses(times)
     between = np.random.default_rng(1).integers(times[0], times[-1] + 1, 1000)
     seconds, at = (times - times[0]) * 1e-9, (between - times[0]) * 1e-9

@@ -1,4 +1,4 @@
-"""Rendering: densities of nothing and of everything, rays without length, half precision."""
+"""Cases of rendering: extreme densities, rays without length, half precision."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch import Tensor
 
 from enerf_ns.bench.numerics.case import case
 from enerf_ns.bench.numerics.small_run import quiet, small_trainer
-from enerf_ns.rendering.field import brightness_of, limited_exp
+from enerf_ns.rendering.field import Brightness, brightness_of, limited_exp
 from enerf_ns.sensor.response import Linlog, Logarithm, Response
 from enerf_ns.supervision.event_supervision import brightness_change
 
 DENSITIES = (0.0, 1e-42, 1e-6, 1e-2, 1.0, 1e2, 1e6, 1e20, 3e38)
-"""Densities from nothing over a number that float32 holds to some digits only to its largest."""
+"""Densities from 0, with a subnormal number, to the largest float32 number."""
 
 
 def _samples(edges: Tensor) -> RaySamples:
-    """Samples between the edges (rays, samples + 1) of stretches of rays."""
+    """Samples between edges (rays, samples + 1) along rays."""
     starts, ends = edges[..., :-1, None], edges[..., 1:, None]
     shape = (*starts.shape[:-1], 3)
     frustums = Frustums(torch.zeros(shape), torch.ones(shape), starts, ends, torch.ones_like(starts))
@@ -40,7 +40,10 @@ def densities() -> float:
 
 
 @case(
-    "density logits from -1e4 to 1e4", "finite weights and gradients, which push back what is too dense", 0, "numbers"
+    "density logits from -1e4 to 1e4",
+    "finite weights and gradients, and a gradient that lowers large densities",
+    0,
+    "numbers",
 )
 def density_logits() -> float:
     logits = torch.linspace(-1e4, 1e4, 201)[None, :, None].requires_grad_()
@@ -53,7 +56,7 @@ def density_logits() -> float:
 
 @cache
 def _pipeline() -> Any:
-    """A pipeline whose field has begun to learn."""
+    """A pipeline after 40 training steps."""
     trainer: Any = small_trainer()
     with quiet():
         for step in range(40):
@@ -90,7 +93,7 @@ def odd_rays() -> float:
     return wrong
 
 
-@case("a ray without length", "nothing: no weight, no gradient that is not finite", 0)
+@case("a ray without length", "zero weight, finite gradients", 0)
 def no_length() -> float:
     density = torch.full((1, 8, 1), 1e20, requires_grad=True)
     weights = _samples(torch.ones(1, 9)).get_weights(density)
@@ -99,7 +102,7 @@ def no_length() -> float:
 
 
 def _half_error(dtype: torch.dtype) -> float:
-    """Error of the change of log brightness under autocast, as a share of its spread, from the same samples."""
+    """Error of the change of log brightness under autocast, relative to its root mean square, at the same samples."""
     pipeline = _pipeline()
     model, manager = pipeline.model, pipeline.datamanager
     batch = manager.next_batch(model.sensor)
@@ -120,25 +123,35 @@ def _half_error(dtype: torch.dtype) -> float:
     return float((half.double() - exact.double()).abs().max() / exact.double().square().mean().sqrt())
 
 
-@case("bfloat16 (--mixed-precision True)", "changes of log brightness of float32, as a share of their spread", 1e-4)
+@case("bfloat16 (--mixed-precision True)", "changes of log brightness of float32, relative to their RMS", 1e-4)
 def bfloat16() -> float:
     return _half_error(torch.bfloat16)
 
 
-@case("float16 (--mixed-precision True)", "changes of log brightness of float32, as a share of their spread", 1e-4)
+@case("float16 (--mixed-precision True)", "changes of log brightness of float32, relative to their RMS", 1e-4)
 def float16() -> float:
     return _half_error(torch.float16)
 
 
-def _fit_error(spread: float, response: Response) -> float:
-    """Root mean square error of log brightness of a field with the activation for high dynamic range, fitted to values
-    over a spread."""
+def fit_error(
+    spread: float, response: Response, activation: Brightness = "exponential", steps: int = 1500, rate: float = 0.05
+) -> float:
+    """Root mean square error of log brightness after Adam has fitted 1000 free numbers to evenly spread values.
+
+    Args:
+        spread: Range of log brightness; its offset is free.
+        response: From brightness to log brightness.
+        activation: From the free numbers, which stand for the network's output, to brightness.
+        steps: Of Adam.
+        rate: Learning rate of Adam.
+    """
     wanted = torch.linspace(0.0, spread, 1000)
     output = torch.zeros(1000, requires_grad=True)
-    optimizer = torch.optim.Adam([output], lr=0.05)
-    for _ in range(1500):
+    optimizer = torch.optim.Adam([output], lr=rate)
+    error = wanted
+    for _ in range(steps):
         optimizer.zero_grad()
-        found = response(brightness_of(output, "exponential"))
+        found = response(brightness_of(output, activation))
         error = (found - found.mean()) - (wanted - wanted.mean())
         error.square().mean().backward()
         optimizer.step()
@@ -147,9 +160,9 @@ def _fit_error(spread: float, response: Response) -> float:
 
 @case("log brightness over 10, linlog", "root mean square error of a fit", 0.1)
 def dynamic_range_linlog() -> float:
-    return _fit_error(10.0, Linlog())
+    return fit_error(10.0, Linlog())
 
 
 @case("log brightness over 10, logarithm", "root mean square error of a fit", 0.1)
 def dynamic_range_logarithm() -> float:
-    return _fit_error(10.0, Logarithm(0.001))
+    return fit_error(10.0, Logarithm(0.001))

@@ -1,4 +1,4 @@
-"""The scene: worlds far away, gaps of the poses, cameras that only turn, things beyond the box."""
+"""Cases of the scene: distant origins, gaps of the poses, pure rotation, points beyond the box."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from enerf_ns.poses.posed_camera import PosedCamera
 
 
 def _rays_apart(origin: float) -> float:
-    """Largest distance, in metres, of event rays' origins from those of Nerfstudio's cameras at the same instants."""
+    """Largest distance in metres between origins of event rays and Nerfstudio's cameras at the same times."""
     recording = read_recording(small_recording())
     assert recording.frames is not None
     old = recording.trajectory
@@ -45,7 +45,7 @@ def far_world() -> float:
     return max(_rays_apart(origin) for origin in (0.0, 1e4, 1e5, 1e6, 5e6))
 
 
-@case("two seconds without poses", "no pair, of events or silent, begins or ends there", 0, "pairs")
+@case("two seconds without poses", "no event pair or silent pair begins or ends there", 0, "pairs")
 def pose_gap() -> float:
     events, whole, _ = recording_of_points(points_between(1, 3), shaking(0.1), TURNING)
     times = whole.times * 4  # eight seconds, of which two are cut
@@ -66,7 +66,7 @@ def pose_gap() -> float:
     )
 
 
-@case("a camera that only turns, poses off by 1e-6 to 1e-2 m", "no depth is made of noise", 0, "depths")
+@case("a camera that only turns, poses off by 1e-6 to 1e-2 m", "no depth is estimated from noise", 0, "depths")
 def rotation() -> float:
     events, still, _ = recording_of_points(points_between(1, 3), np.zeros((2000, 3)), TURNING)
     wrong = 0
@@ -77,7 +77,7 @@ def rotation() -> float:
     return wrong
 
 
-@case("60 % of the points at 300 m, the others at 1 to 2 m", "the share of their events, as far beyond", 0.05)
+@case("60 % of the points at 300 m, the others at 1 to 2 m", "the share of events from beyond the depth range", 0.05)
 def beyond() -> float:
     generator = np.random.default_rng(4)
     depths = np.exp(generator.uniform(0.0, np.log(2.0), (400, 1)))

@@ -1,4 +1,4 @@
-"""Scores: pictures of nothing, negatives, pictures too small, depths that nobody knows."""
+"""Cases of scores: flat and negative renders, NaN, small pictures, unknown depth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from enerf_ns.sensor.response import inverse_linlog, linlog
 
 
 def _picture(height: int = 32, width: int = 40) -> Tensor:
-    """A grey picture without two rows that are alike."""
+    """A grey picture whose rows are all different."""
     rows, columns = torch.arange(height)[:, None] / height, torch.arange(width)[None] / width
     return (0.2 + 0.5 * (rows * columns + 0.3 * torch.sin(9.0 * rows)).abs())[..., None].expand(-1, -1, 3)
 
@@ -31,21 +31,21 @@ def _scored(views: list[HeldOutView]) -> tuple[dict[str, float], dict[str, Any]]
     return means, dict(reasons)
 
 
-@case("a render that is the negative of its frame", "no fit, and the reason", 0, "things amiss")
+@case("a render that is the negative of its frame", "no fit, and the reason", 0, "faults")
 def negative() -> float:
     recorded = _picture()
     (fault,) = align([1.0 - recorded], [recorded], DEFAULT_PROTOCOL).faults
     return int("negative" not in (fault or ""))
 
 
-@case("a render that is flat", "no fit and no correlation, and the reasons", 0, "things amiss")
+@case("a render that is flat", "no fit and no correlation, and the reasons", 0, "faults")
 def flat() -> float:
     recorded, rendered = _picture(), torch.full((32, 40, 3), 0.4)
     means, reasons = _scored([_view(recorded, rendered)])
     return sum(int(name in means) + int(name not in reasons) for name in ("psnr", "correlation"))
 
 
-@case("a brightness fit of 0.02 to 50 times the contrast", "the scale that was applied, as a share", 1e-4)
+@case("a brightness fit of 0.02 to 50 times the contrast", "the applied scale, relative error", 1e-4)
 def fitted() -> float:
     recorded = _picture()
     errors = []
@@ -56,7 +56,7 @@ def fitted() -> float:
     return max(errors)
 
 
-@case("one frame of three whose render has a NaN", "means over the two others, and the reason", 0, "things amiss")
+@case("one frame of three whose render has a NaN", "means over the two others, and the reason", 0, "faults")
 def nan_pixel() -> float:
     recorded = _picture()
     spoilt = recorded.clone()
@@ -77,7 +77,7 @@ def no_depth() -> float:
     return abs(means["depth_rmse"] - 0.5) + int("depth_rmse" not in reasons)
 
 
-@case("pictures of 8 x 8 and 16 x 16 pixels", "what can be scored, and the reasons for the rest", 0, "things amiss")
+@case("pictures of 8 x 8 and 16 x 16 pixels", "the possible scores, and reasons for the others", 0, "faults")
 def small_pictures() -> float:
     amiss = 0
     for side in (8, 16):

@@ -1,4 +1,4 @@
-"""A recording of a tenth of a second and runs on it that take a second, for cases that need a whole run."""
+"""A recording of 0.1 s, and runs on it that take a second, for cases that need a whole run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SMALL = {
     "pipeline.model.num_samples": 16,
     "pipeline.model.sampling": "proposal",
 }
-"""What makes a run small, by the names of ns-train's flags."""
+"""Settings of a small run, by the names of ns-train's flags."""
 
 
 @cache
@@ -42,7 +42,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 
 @cache
 def small_recording() -> Path:
-    """A room seen for a tenth of a second by 32 x 24 pixels, with frames and depth; removed when the process ends."""
+    """Path of a recording of 0.1 s at 32 x 24 pixels with frames and depth. It is removed when the process ends."""
     folder = Path(_folder().name) / "recording"
     settings = SimulationSettings("shapes", width=32, height=24, duration=0.1, num_frames=11, exposure_ms=5.0)
     with quiet():
@@ -63,14 +63,14 @@ def small_config(changes: Mapping[str, Any] = MappingProxyType({})) -> EnerfTrai
 
 
 def small_trainer(changes: Mapping[str, Any] = MappingProxyType({})) -> EnerfTrainer:
-    """A trainer of a small run, as `ns-train` sets it up."""
+    """The trainer of a small run, set up as `ns-train` does."""
     with quiet():
         return set_up(small_config(changes))
 
 
 @contextmanager
 def quiet() -> Iterator[list[str]]:
-    """Nothing is printed within the block; what would have been is in the list afterwards."""
+    """Suppresses output within the block, and collects it in the list."""
     printed: list[str] = []
     with redirect_stdout(StringIO()) as plain, CONSOLE.capture() as captured:
         yield printed

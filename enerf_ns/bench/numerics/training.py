@@ -1,4 +1,4 @@
-"""Training: numbers that are none, senseless recordings, steps of one pair, runs that are cut in two."""
+"""Cases of training: NaN, senseless events, steps of one pair, interrupted runs, damaged checkpoints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from enerf_ns.method.runs import set_up, train
 
 
 def _state(trainer: Any) -> dict[str, Tensor]:
-    """All parameters, and the running means of the optimisers."""
+    """All parameters, and the moments of the optimisers."""
     state = {name: value.detach().clone() for name, value in trainer.pipeline.model.named_parameters()}
     for group, optimizer in trainer.optimizers.optimizers.items():
         for number, values in optimizer.state_dict()["state"].items():
@@ -26,14 +26,14 @@ def _state(trainer: Any) -> dict[str, Tensor]:
 
 
 def _different(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> float:
-    """How many numbers of two states differ, or are there in only one."""
+    """Number of values that differ between two states."""
     if first.keys() != second.keys():
         return float(len(first.keys() ^ second.keys()))
     return float(sum(int((first[name] != second[name]).sum()) for name in first))
 
 
 def _changed_by(spoil: Callable[[Any], None]) -> float:
-    """Numbers of the state that a spoilt step changes, and those that are not finite after the next, sound one."""
+    """Number of values that a corrupted step changes, plus values that are not finite after the next, normal step."""
     trainer: Any = small_trainer()
     with quiet():
         trainer.train_iteration(0)
@@ -84,7 +84,7 @@ def nan_origin() -> float:
 def _not_finite_after(
     steps: int, changes: Mapping[str, Any], of_events: Callable[[EventBatch], EventBatch] | None = None
 ) -> float:
-    """Losses and parameters that are not finite in a short training, whose events may be others than were recorded."""
+    """Number of losses that are not finite, plus skipped steps, in a short training on optionally replaced events."""
     trainer: Any = small_trainer(changes)
     manager = trainer.pipeline.datamanager
     if of_events is not None:
@@ -125,7 +125,7 @@ def one_pair() -> float:
     return _not_finite_after(60, {"pipeline.datamanager.event_pairs": 1, "pipeline.datamanager.silent_pairs": 1})
 
 
-@case("a learning rate of 1", "finite losses, and a line that says that nothing is learnt", 0, "things amiss")
+@case("a learning rate of 1", "finite losses, and a warning that nothing is learnt", 0, "faults")
 def collapse() -> float:
     config = small_config({"max_num_iterations": 350})
     config.optimizers["fields"]["optimizer"].lr = 1.0
@@ -135,7 +135,7 @@ def collapse() -> float:
     return int(not finite) + int("Nothing is learnt" not in printed[0])
 
 
-@case("a run cut in two after 30 of 60 steps", "the weights and running means of one that was not", 0, "numbers")
+@case("a run cut in two after 30 of 60 steps", "the weights and moments of an uninterrupted run", 0, "numbers")
 def resumed() -> float:
     with quiet():
         whole: Any = small_trainer()

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from small_runs import SMALL
 
 from enerf_ns.bench.numerics import parts
-from enerf_ns.bench.numerics.parts import SAMPLES, PartError, as_markdown, error_of_parts, pose_interpolation
+from enerf_ns.bench.numerics.parts import SAMPLES, PartError, error_of_parts, pose_interpolation
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.runs import Run, method_config, train
@@ -154,11 +154,3 @@ def test_poses_in_parts_that_are_not_used_do_not_count():
     errors = [by_name(pose_interpolation(trajectory, used, CAMERA, 2.0)) for used in (whole, parted)]
     name = "pose interpolation, one of 2 poses", "m"
     assert errors[0][name] > 0.1 and errors[1][name] < 1e-12
-
-
-def test_a_table_has_a_line_for_each_error():
-    rows = [PartError("quadrature", "2048 samples", 0.0123456, "log brightness"), PartError("poses", "all", 2.0, "m")]
-    assert as_markdown(rows).splitlines()[2:] == [
-        "| quadrature | 2048 samples | 0.012 log brightness |",
-        "| poses | all | 2 m |",
-    ]
