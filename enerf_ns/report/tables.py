@@ -110,7 +110,7 @@ def history_csv(runs: Sequence[tuple[str, Sequence[HistoryRow]]]) -> str:
     optional = ("lpips_vgg", *AT_END)
     scores = [name for name in SCORES if name not in optional or any(name in row.scores for _, row in rows)]
     losses = list(dict.fromkeys(loss for _, row in rows for loss in row.losses))
-    lines = [["run", "seconds", "step", *scores, "num_frames", *losses]]
+    lines: list[list[object]] = [["run", "seconds", "step", *scores, "num_frames", *losses]]
     for name, row in rows:
         values = [row.scores.get(score, "") for score in scores]
         terms = [row.losses.get(loss, "") for loss in losses]

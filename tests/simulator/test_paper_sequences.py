@@ -32,6 +32,7 @@ def rays_of(preset: SimulationPreset) -> tuple[np.ndarray, float]:
 
 
 def poses_of(preset: SimulationPreset, seed: int, times: np.ndarray) -> np.ndarray:
+    assert preset.scene is not None
     trajectory = preset.trajectory(CAMERAS[preset.scene], np.zeros(3), np.random.default_rng(seed))
     return trajectory.poses(torch.from_numpy(times.astype(np.int64))).numpy()
 
