@@ -51,7 +51,9 @@ def event_pair() -> plt.Figure:
         axes.scatter(when[index], at[index], s=130, facecolors="none", edgecolors=LINE, linewidths=1.5, zorder=4)
     arrow = {"arrowstyle": "<->", "color": LINE, "linewidth": 1.5}
     axes.vlines(when[second], *sorted((at[first], at[second])), color=PALE, linewidth=0.8, linestyle="--")
-    axes.annotate("", (when[second], at[second]), (when[first], at[first]), arrowprops={**arrow, "shrinkA": 7, "shrinkB": 7})
+    axes.annotate(
+        "", (when[second], at[second]), (when[first], at[first]), arrowprops={**arrow, "shrinkA": 7, "shrinkB": 7}
+    )
     label = f"a pair: {on} on, {off} off\nmeasured change = {on} C_on - {off} C_off = {threshold * (on - off):+.2f}"
     middle = 0.5 * (when[first] + when[second])
     axes.annotate(label, (middle, level.min() - 0.1), ha="center", va="bottom")
@@ -74,13 +76,17 @@ def sensor_model() -> plt.Figure:
     for number, (name, what, flag) in enumerate(steps):
         x = 1.6 * number
         ends = number in (0, len(steps) - 1)
-        box = FancyBboxPatch((x, 0), 1.2, 0.8, boxstyle="round,pad=0.04", facecolor="white" if ends else "#eef2fa", edgecolor=LINE)
+        box = FancyBboxPatch(
+            (x, 0), 1.2, 0.8, boxstyle="round,pad=0.04", facecolor="white" if ends else "#eef2fa", edgecolor=LINE
+        )
         axes.add_patch(box)
         axes.text(x + 0.6, 0.6, name, ha="center", va="center", weight="bold")
         axes.text(x + 0.6, 0.24, what, ha="center", va="center", fontsize=9)
         axes.text(x + 0.6, -0.14, flag, ha="center", va="top", fontsize=8, family="monospace", color=OFF)
         if number:
-            axes.add_patch(FancyArrowPatch((x - 0.34, 0.4), (x - 0.05, 0.4), arrowstyle="-|>", mutation_scale=12, color=LINE))
+            axes.add_patch(
+                FancyArrowPatch((x - 0.34, 0.4), (x - 0.05, 0.4), arrowstyle="-|>", mutation_scale=12, color=LINE)
+            )
     axes.set(xlim=(-0.1, 1.6 * len(steps) - 0.3), ylim=(-0.6, 0.95))
     axes.axis("off")
     return figure
@@ -106,17 +112,30 @@ def sampling() -> plt.Figure:
     fine = PairedPDFSampler().eval()(rays, coarse, expected, num_samples=24)
     fine_edges = torch.cat([fine.frustums.starts[0, :, 0], fine.frustums.ends[0, -1:, 0]]).numpy()
 
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(8, 3.8), sharex=True, layout="constrained", height_ratios=(3, 2))
+    figure, (upper, lower) = plt.subplots(
+        2, 1, figsize=(8, 3.8), sharex=True, layout="constrained", height_ratios=(3, 2)
+    )
     distance = np.linspace(0.5, 4.0, 1400)
     depth = np.concatenate([[0.0], np.cumsum(density(distance)[:-1] * np.diff(distance))])
     upper.fill_between(distance, density(distance) / 40.0, color="#d8dce6", label="density (of its maximum)")
     upper.plot(distance, np.exp(-depth), color=LINE, label="transmittance")
     upper.legend(frameon=False, loc="upper right")
     upper.set(ylim=(0, 1.1))
-    for edges, height, colour, name in ((coarse_edges, 1.0, PALE, "48 of the proposal network"), (fine_edges, 0.0, ON, "24 of the field")):
+    for edges, height, colour, name in (
+        (coarse_edges, 1.0, PALE, "48 of the proposal network"),
+        (fine_edges, 0.0, ON, "24 of the field"),
+    ):
         middles = 0.5 * (edges[1:] + edges[:-1])
         lower.vlines(middles, height, height + 0.25, color=colour, linewidth=1.2)
-        lower.bar(edges[:-1], 0.5 * weights(edges) / weights(edges).max(), np.diff(edges), height + 0.3, align="edge", color=colour, alpha=0.45)
+        lower.bar(
+            edges[:-1],
+            0.5 * weights(edges) / weights(edges).max(),
+            np.diff(edges),
+            height + 0.3,
+            align="edge",
+            color=colour,
+            alpha=0.45,
+        )
         lower.text(4.03, height + 0.12, name, va="center", color=LINE, fontsize=9)
     lower.set(xlabel="distance from the camera, m", xlim=(0.5, 4.0), yticks=[])
     lower.spines["left"].set_visible(False)
