@@ -1,4 +1,4 @@
-"""The code on the pages: every command is parsed by its own parser, examples in Python run, and tutorials are followed."""
+"""The code on the pages: programs parse their commands, examples in Python run, and tutorials are followed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,9 @@ import tyro
 from recordings import write_davis
 from small_runs import SMALL
 
+from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.formats.writer import camera_json
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.scripts import cli
 
@@ -45,7 +48,7 @@ class Command:
     page: str
     words: tuple[str, ...]
     in_sentence: bool
-    """Whether it is in the text, where a command may be named without its arguments."""
+    """Whether it stands in a sentence, which may name a command without its arguments."""
 
     def __str__(self) -> str:
         return f"{self.page}: {' '.join(self.words)}"
@@ -162,11 +165,11 @@ def flags_of(command: str) -> set[str]:
 
 
 def help_of(called: Callable[[], object]) -> set[str]:
-    said = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         patch.setenv("COLUMNS", "200")
         called()
-    return set(re.findall(r"--[\w.-]*\w", said.getvalue()))
+    return set(re.findall(r"--[\w.-]*\w", printed.getvalue()))
 
 
 def test_a_flag_that_does_not_exist_is_found():
@@ -200,7 +203,7 @@ def test_messages_of_the_page_of_errors_are_those_of_the_package():
 
 
 def strings_of_the_package() -> Iterator[str]:
-    """All texts in its sources; parts of an f-string are joined by what they leave open."""
+    """Every text in the sources of the package, each part of an f-string by itself."""
     for folder in ("enerf_ns", "dataparsers"):
         for file in (ROOT / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text())):
@@ -211,8 +214,8 @@ def strings_of_the_package() -> Iterator[str]:
 # --------------------------------------------------------------------------------------------------- examples in Python
 
 PYTHON = [(page, number) for page in PAGES for number in range(len(blocks(page, "python")))]
-ELSEWHERE = {"hash-grid.md", "extending.md"}
-"""Pages whose examples other tests run: `tests/kernels/test_fast_hash_encoding.py`, `tests/test_extending.py`."""
+ELSEWHERE = {"hash-grid.md", "notebook.md"}
+"""Pages whose examples other tests run: `tests/kernels/test_fast_hash_encoding.py`, and the test of the notebook."""
 
 
 @pytest.mark.parametrize(("page", "number"), PYTHON, ids=lambda value: getattr(value, "name", str(value)))
@@ -226,8 +229,9 @@ def test_examples_in_python_import_what_exists(page: Path, number: int):
 
 @pytest.fixture
 def folder(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A current folder with what the pages name: path/to/recording and a bag; small runs, and no windows."""
+    """The current folder, with path/to/recording. Runs are small, plots open no window, and nothing stays registered."""
     from enerf_ns.method import runs
+    from enerf_ns.supervision import event_supervision
 
     (tmp_path / "path" / "to").mkdir(parents=True)
     shutil.copytree(recording, tmp_path / "path" / "to" / "recording")
@@ -235,14 +239,18 @@ def folder(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.setenv("ENERF_LPIPS_WEIGHTS", str(tmp_path / "no-weights"))
     whole = runs.method_config
-    monkeypatch.setattr(
-        runs, "method_config", lambda *args, **kw: whole(*args[:3], {**(args[3:] or ({},))[0], **SMALL})
-    )
+
+    def smaller(name: str, data: Path, output_dir: Path, changes: Mapping[str, Any] = MappingProxyType({})) -> Any:
+        return whole(name, data, output_dir, {**changes, **SMALL})
+
+    monkeypatch.setattr(runs, "method_config", smaller)
+    monkeypatch.setattr(registry, "_FORMATS", dict(registry._FORMATS))
+    monkeypatch.setattr(event_supervision, "EVENT_LOSSES", dict(event_supervision.EVENT_LOSSES))
     return tmp_path
 
 
 def arrays(recording: Path) -> dict[str, Any]:
-    """What the page on NumPy asks for, of a recording."""
+    """The arrays that the page on NumPy needs, from a recording."""
     read = read_recording(recording)
     events, trajectory = index_events(read).events(), read.trajectory
     return {
@@ -253,7 +261,7 @@ def arrays(recording: Path) -> dict[str, Any]:
 
 
 def write_bag(path: Path, recording: Path) -> int:
-    """The events and poses of a recording as a bag of ROS 1; how many events."""
+    """Writes 500 events and all poses of a recording as a bag of ROS 1; returns the number of events."""
     bags = import_module("test_esim_bag")
     given = arrays(recording)
     messages: list[tuple[str, int, object]] = []
@@ -277,12 +285,12 @@ def write_bag(path: Path, recording: Path) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if blocks(page, "python") and page.name not in {*ELSEWHERE, "notebook.md"}],
+    [page for page in PAGES if blocks(page, "python") and page.name not in ELSEWHERE],
     ids=lambda page: page.name,
 )
 def test_examples_in_python_run(page: Path, folder: Path, recording: Path):
     """The blocks of a page run one after another, as a reader would paste them."""
-    names: dict[str, Any] = {"__name__": "page", **arrays(recording)}
+    names: dict[str, Any] = {"__name__": "page", "read": read_recording, **arrays(recording)}
     if page.name == "tutorial-files-and-bags.md":
         pytest.importorskip("rosbags")
         expected = write_bag(folder / "recording.bag", recording)
@@ -322,7 +330,7 @@ def test_the_cells_of_the_notebook_run(folder: Path, capsys: pytest.CaptureFixtu
     assert changed == 1
     exec(compile(source, "demo.ipynb", "exec"), {"__name__": "notebook"})
     printed = capsys.readouterr().out
-    assert "PSNR" in printed and "config.yml" in printed
+    assert "depth_rmse" in printed and "config.yml" in printed
 
 
 @pytest.mark.slow
@@ -339,11 +347,11 @@ SMALLER = {
     "report": ["--no-video", "--lpips"],
     "enerf": [word for name, value in SMALL.items() for word in (f"--{name.replace('_', '-')}", str(value))],
 }
-"""What makes a command small: its flags stand last, or, of a method, first. A run has a name, not a time."""
+"""Flags that make a command small, by command; the flags of a method stand first. A run has a name, not a time."""
 
 FOLLOWED = ("tutorial-simulated.md", "tutorial-davis.md", "tutorial-numpy.md", "tutorial-frames-and-events.md")
 SKIPPED = ("ns-render", "ns-viewer", "ns-export")
-"""Of Nerfstudio, and tested elsewhere."""
+"""Programs of Nerfstudio, which other tests run."""
 
 
 def small(words: tuple[str, ...], number: int) -> list[str] | None:
@@ -356,8 +364,11 @@ def small(words: tuple[str, ...], number: int) -> list[str] | None:
     while "--max-num-iterations" in rest:
         place = rest.index("--max-num-iterations")
         del rest[place : place + 2]
-    if "time-range" in " ".join(rest):  # of slider_depth; the recording of the test is shorter
+    if "--time-range" in rest:  # of slider_depth; the recording of the test is shorter
         return None
+    if "--exposure-ms" in rest:
+        rest[rest.index("--exposure-ms") + 1] = "5"
+    rest += ["--depth-range", "0.5", "5"] if "event-data" in rest else ["event-data", "--depth-range", "0.5", "5"]
     flags = list(SMALLER["enerf"])
     if number:  # a folder for each run but the first, which the pages go on with
         flags[flags.index("run")] = f"run-{number}"
@@ -383,23 +394,12 @@ def forks() -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.parametrize("name", FOLLOWED)
 def test_a_tutorial_can_be_followed(name: str, folder: Path, recording: Path, forks: subprocess.Popen[str]):
     """Its commands run one after another in one folder, each in a process of its own."""
-    shutil.copytree(recording, folder / "recordings" / "ready")
     if name == "tutorial-davis.md":
         write_davis_of(recording, folder / "slider_depth")
     if name == "tutorial-numpy.md":
         exec(blocks(ROOT / "docs" / name, "python")[0], arrays(recording))
-        about = folder / "my-recording" / "recording.json"
-        read = read_recording(recording).camera
-        told = {
-            "width": 32,
-            "height": 24,
-            "model": "pinhole",
-            "fx": read.fx,
-            "fy": read.fy,
-            "cx": read.cx,
-            "cy": read.cy,
-        }
-        about.write_text(json.dumps({"camera": told}))
+        about = {"camera": camera_json(read_recording(recording).camera)}
+        (folder / "my-recording" / "recording.json").write_text(json.dumps(about))
     trained = 0
     for block in blocks(ROOT / "docs" / name, "bash"):
         for line in joined(block):
@@ -439,9 +439,9 @@ def run(forks: subprocess.Popen[str], command: list[str], folder: Path) -> None:
     """
     printed = folder / "printed.txt"
     printed.unlink(missing_ok=True)
-    told = {"program": command[0], "arguments": command[1:], "folder": str(folder), "environment": dict(os.environ)}
+    asked = {"program": command[0], "arguments": command[1:], "folder": str(folder), "environment": dict(os.environ)}
     assert forks.stdin is not None and forks.stdout is not None
-    forks.stdin.write(json.dumps({**told, "output": str(printed), "limit": 120}) + "\n")
+    forks.stdin.write(json.dumps({**asked, "output": str(printed), "limit": 120}) + "\n")
     forks.stdin.flush()
     code = int(forks.stdout.readline())
     assert code == 0, f"{shlex.join(command)}\n{printed.read_text(errors='replace')[-3000:]}"

@@ -38,8 +38,9 @@ def read_config(path: Path) -> TrainerConfig:
             config = yaml.load(text, Loader=yaml.Loader)  # as Nerfstudio reads it
         except yaml.constructor.ConstructorError as error:
             raise RecordingError(
-                f"{path} names what is not installed ({error.problem}); install the package of its method, or, if an "
-                "earlier version of this one wrote it, edit it as docs/continuing.md shows (“Runs of earlier versions”)."
+                f"{path} names what is not installed ({error.problem}); install the package of its method, or, if "
+                "an earlier version of this one wrote it, edit it as docs/continuing.md shows (“Runs of earlier "
+                "versions”)."
             ) from error
     if not isinstance(config, TrainerConfig):
         raise RecordingError(f"{path} is not the config.yml of a run; give the folder of a run.")
