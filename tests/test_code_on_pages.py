@@ -229,7 +229,7 @@ def test_examples_in_python_import_what_exists(page: Path, number: int):
 
 @pytest.fixture
 def folder(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with path/to/recording. Runs are small, plots open no window, and nothing stays registered."""
+    """The current folder, with path/to/recording. Runs are small, plots open no window, nothing stays registered."""
     from enerf_ns.method import runs
     from enerf_ns.supervision import event_supervision
 

@@ -36,8 +36,9 @@ WITHOUT_NERFSTUDIO = [
 
 
 def run_python(code: str, python: str | Path = sys.executable) -> str:
-    """Output of a fresh interpreter outside the source tree."""
-    run = subprocess.run([python, "-c", code], cwd=ROOT.parent, capture_output=True, text=True)
+    """The output of a fresh interpreter outside the source tree; that of another environment sees no PYTHONPATH."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH" or python == sys.executable}
+    run = subprocess.run([python, "-c", code], cwd=ROOT.parent, capture_output=True, text=True, env=kept)
     assert run.returncode == 0, run.stderr
     return run.stdout
 
