@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -11,6 +12,7 @@ matplotlib.use("svg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from nerfstudio.cameras.rays import RayBundle
 
@@ -19,10 +21,10 @@ from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 
 ON, OFF, LINE, PALE = "#c1352b", "#2b5fc1", "#333333", "#9a9a9a"
-STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "path"}
+STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "path"}
 
 
-def event_pair() -> plt.Figure:
+def event_pair() -> Figure:
     """Log brightness of one pixel, the events that the simulated sensor makes of it, and a pair of them."""
     threshold, response = 0.25, "logarithm:0.001"
     times = np.linspace(0, 40e6, 801).astype(np.int64)
@@ -62,7 +64,7 @@ def event_pair() -> plt.Figure:
     return figure
 
 
-def sensor_model() -> plt.Figure:
+def sensor_model() -> Figure:
     """The steps from brightness to events, and the parameter of each."""
     steps = [
         ("brightness", "of the rays of\nthe pixel", ""),
@@ -92,7 +94,7 @@ def sensor_model() -> plt.Figure:
     return figure
 
 
-def sampling() -> plt.Figure:
+def sampling() -> Figure:
     """Two surfaces along a ray: samples of the proposal network, samples of the field, and the weights of both."""
 
     def density(distance: np.ndarray) -> np.ndarray:
@@ -104,8 +106,9 @@ def sampling() -> plt.Figure:
         return np.exp(-before) * (1.0 - np.exp(-thickness))
 
     torch.manual_seed(0)
-    ends = {"nears": torch.tensor([[0.5]]), "fars": torch.tensor([[4.0]])}
-    rays = RayBundle(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1, 1), **ends)
+    forward = torch.tensor([[0.0, 0.0, 1.0]])
+    near, far = torch.tensor([[0.5]]), torch.tensor([[4.0]])
+    rays = RayBundle(torch.zeros(1, 3), forward, torch.ones(1, 1), nears=near, fars=far)
     coarse = PairedUniformSampler().eval()(rays, num_samples=48)
     coarse_edges = torch.cat([coarse.frustums.starts[0, :, 0], coarse.frustums.ends[0, -1:, 0]]).numpy()
     expected = torch.from_numpy(weights(coarse_edges)).float()[None, :, None]
