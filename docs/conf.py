@@ -16,9 +16,12 @@ html_theme = "sphinx_book_theme"
 html_title = "enerf-ns"
 html_theme_options = {"show_toc_level": 2, "use_download_button": False, "navbar_persistent": []}
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+highlight_language = "text"  # of blocks that name no language
 myst_heading_anchors = 3
 default_role = "code"
-suppress_warnings = ["ref.python"]  # the names of axes in shapes are no names of classes
+suppress_warnings = ["ref.python"]  # Sphinx takes the names of axes in shapes for names of classes
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -28,24 +31,27 @@ COMMANDS_PAGE = Path(__file__).with_name("commands.md")
 
 
 def write_commands(app: Any) -> None:
-    """Writes the page of all commands and their flags, as each says them itself."""
+    """Writes the page of all commands and their flags from the output of `--help` of each command."""
     from enerf_ns.scripts.cli import COMMANDS
 
     programs = {f"enerf {name}": ["enerf", name] for name in COMMANDS} | {"ns-train enerf": ["ns-train", "enerf"]}
     environment = {**os.environ, "COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
 
-    def said(program: list[str]) -> str:
+    def help_of(program: list[str]) -> str:
         path = Path(sys.executable).with_name(program[0])
         command = [path, *program[1:], "--help"]
         return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        texts = list(pool.map(said, programs.values()))
+        texts = list(pool.map(help_of, programs.values()))
     sections = [f"## {name}\n\n```text\n{text.strip()}\n```" for name, text in zip(programs, texts, strict=True)]
-    head = "# Commands and flags\n\nWhat each command says with `--help`. Flags of `ns-train enerf` stand last."
+    head = (
+        "# Commands and flags\n\nThe output of `--help` of each command. [Training](training.md) lists the flags of "
+        "`ns-train enerf`, which stand last here, by purpose."
+    )
     COMMANDS_PAGE.write_text("\n\n".join([head, *sections]) + "\n")
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx."""
+    """Connects the function that Sphinx calls before it reads the pages."""
     app.connect("builder-inited", write_commands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -16,7 +17,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "RE
 
 
 def anchors(page: Path) -> set[str]:
-    """Of the headings of a page, as GitHub and MyST make them."""
+    """The anchors of the headings of a page, as GitHub and MyST make them."""
     titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -31,9 +32,14 @@ def test_links_lead_somewhere(page: Path):
         assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
 
 
-def test_every_page_is_reached_from_the_readme():
-    linked = set(re.findall(r"\]\(docs/([\w-]+)\.md\)", (ROOT / "README.md").read_text()))
-    assert {page.stem for page in DOCS} == linked | {"index"}
+def test_every_page_is_in_the_side_bar_and_the_readme_is_short():
+    index = (ROOT / "docs" / "index.md").read_text()
+    listed = [
+        name
+        for tree in re.findall(r"```{toctree}\n(.*?)```", index, re.DOTALL)
+        for name in re.findall(r"^[\w-]+$", tree, re.M)
+    ]
+    assert sorted(listed) == sorted({page.stem for page in [*DOCS, WRITTEN_BY_SPHINX]} - {"index"})
     assert len((ROOT / "README.md").read_text().splitlines()) <= 200
 
 
@@ -52,3 +58,14 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path):
     assert {page.stem for page in [*DOCS, WRITTEN_BY_SPHINX]} <= {
         file.stem for file in (tmp_path / "site").glob("*.html")
     }
+    found = json.loads(
+        (tmp_path / "site" / "searchindex.js").read_text().removeprefix("Search.setIndex(").rstrip(");\n")
+    )
+    for stem, page in {"refractori": "sensor", "quaternion": "errors", "checkpoint": "continuing"}.items():
+        kept = [found[kind].get(stem, []) for kind in ("terms", "titleterms")]
+        numbers = [number for each in kept for number in ([each] if isinstance(each, int) else each)]
+        assert page in {found["docnames"][number] for number in numbers}, f"the search for {stem} misses {page}"
+    outside = re.findall(
+        r"<(?:script|link)[^>]*(?:src|href)=\"(?:https?:)?//[^\"]+\"", (tmp_path / "site" / "search.html").read_text()
+    )
+    assert outside == [], "the search works without a network"

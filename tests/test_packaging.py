@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import venv
+import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -34,8 +36,9 @@ WITHOUT_NERFSTUDIO = [
 
 
 def run_python(code: str, python: str | Path = sys.executable) -> str:
-    """Output of a fresh interpreter outside the source tree."""
-    run = subprocess.run([python, "-c", code], cwd=ROOT.parent, capture_output=True, text=True)
+    """The output of a fresh interpreter outside the source tree; that of another environment sees no PYTHONPATH."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH" or python == sys.executable}
+    run = subprocess.run([python, "-c", code], cwd=ROOT.parent, capture_output=True, text=True, env=kept)
     assert run.returncode == 0, run.stderr
     return run.stdout
 
@@ -103,18 +106,49 @@ def test_entry_points_are_specifications():
         assert type(point.load()).__name__ == SPECIFICATIONS[point.group]
 
 
-@pytest.mark.slow
-def test_wheel_in_a_fresh_environment(tmp_path):
-    """The fresh environment sees the packages of this one behind its own, so that only the wheel is installed."""
-    source = tmp_path / "source"  # a copy: `pip wheel` builds in the source tree, and packs what an earlier build left
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the sources: a build writes into its source tree, and packs files that an earlier build left there."""
+    source = tmp_path_factory.mktemp("packaging") / "source"
     for folder in ("enerf_ns", "dataparsers"):
         shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
     for file in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, source)
-    pip_wheel = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, source]
-    subprocess.run(pip_wheel, check=True)
-    (wheel,) = tmp_path.glob("enerf_ns-*.whl")
+    return source
 
+
+def built_wheel(source: Path, target: Path) -> Path:
+    """The wheel that pip builds of a source tree or a source distribution."""
+    pip_wheel = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-w", target, source]
+    subprocess.run(pip_wheel, check=True)
+    (wheel,) = target.glob("enerf_ns-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(source: Path) -> Path:
+    return built_wheel(source, source.parent / "wheel")
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    """The files of a wheel by name."""
+    with zipfile.ZipFile(wheel) as files:
+        return {name: files.read(name) for name in files.namelist()}
+
+
+@pytest.mark.slow
+def test_the_source_distribution_builds_the_same_wheel(source: Path, wheel: Path, tmp_path: Path):
+    copy = shutil.copytree(source, tmp_path / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
+    build = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=copy, check=True)
+    (archive,) = tmp_path.glob("enerf_ns-*.tar.gz")
+    again = built_wheel(archive, tmp_path / "wheel")
+    assert again.name == wheel.name and contents(again) == contents(wheel)
+
+
+@pytest.mark.slow
+def test_wheel_in_a_fresh_environment(wheel: Path, tmp_path: Path):
+    """The fresh environment sees the packages of this one behind its own, so that only the wheel is installed."""
     environment = tmp_path / "environment"
     venv.create(environment, symlinks=os.name != "nt", with_pip=True)
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
@@ -142,6 +176,31 @@ for point in distribution("enerf-ns").entry_points:
     assert (packages / "enerf_ns" / "report" / "report.html").is_file()
     enerf = subprocess.run([scripts / "enerf", "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert enerf.returncode == 0 and "simulate" in enerf.stdout, enerf.stderr
+
+
+def test_the_oldest_and_the_newest_python_are_tested():
+    """The workflows install the wheel on both ends of requires-python, and run all tests on every version between."""
+    about = (ROOT / "pyproject.toml").read_text()
+    oldest, beyond = map(int, re.findall(r'requires-python = ">=3\.(\d+),<3\.(\d+)"', about)[0])
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    every, ends = (re.findall(r'"3\.(\d+)"', line) for line in re.findall(r"python: \[.*\]", workflow))
+    assert list(map(int, every)) == list(range(oldest, beyond)) and list(map(int, ends)) == [oldest, beyond - 1]
+
+
+def test_the_container_file_copies_and_installs_what_a_build_needs():
+    """It copies files that exist, and installs the system packages of CI and extras of the package."""
+    lines = (ROOT / "Dockerfile").read_text().replace("\\\n", " ").splitlines()
+    copied = {name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]}
+    allowed = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert copied == allowed and all((ROOT / name).exists() for name in copied)
+    assert copied >= {"enerf_ns", "dataparsers", "pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
+    (needed,) = re.findall(r"^needed=\((.*)\)$", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    of_python = {"make", "python3-dev", "python3-venv"}  # which the base image has, or which the image does not use
+    (installed,) = [line for line in lines if "apt-get install" in line]
+    assert set(needed.split()) - of_python <= set(installed.split())
+    extras = set(distribution("enerf-ns").metadata.get_all("Provides-Extra") or [])
+    named = {extra for line in lines for found in re.findall(r"'\.\[([\w,-]+)\]'", line) for extra in found.split(",")}
+    assert named and named <= extras
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The tables of README and pages are those that `enerf bench` makes of the committed result files."""
+"""The tables of the README and of the pages equal those that `enerf bench` makes from the committed result files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ TABLE = re.compile(r"<!-- enerf bench (\S+): (\S+) -->\n(.*?)<!-- end of (\S+) -
 
 
 def tables(readme: str) -> list[tuple[str, str, str]]:
-    """Experiment, result file and text of each table between its marks.
+    """The experiment, the result file and the text of each table between its marks.
 
     Raises:
-        AssertionError: A mark has no end, or that of another.
+        AssertionError: A mark has no end, or the end of another mark.
     """
     found = TABLE.findall(readme)
     assert len(found) == readme.count("<!-- enerf bench ") == readme.count("<!-- end of ")
