@@ -299,29 +299,6 @@ def _slopes(sums: Float64[np.ndarray, "5 *sets"]) -> Float64[np.ndarray, "*sets"
     return (number * my - m * y) / np.maximum(number * mm - m * m, 1e-12)
 
 
-def errors_of_learning(index: EventIndex) -> dict[str, float]:
-    """Standard errors with which events can tell a sensor's parameters to who knows all else, roughly.
-
-    Each event tells by how much brightness changed to about one threshold, independently of the others. So the ratio of
-    thresholds shows as 2 / sqrt(events); a leak as the square root of their number over the time that all pixels were
-    watched (as any rate); and a delay as a shift by a threshold in the median interval between a pixel's events,
-    divided by sqrt(events).
-
-    Args:
-        index: On the CPU.
-
-    Returns:
-        Of the threshold ratio, relative; of the leak rate, on events a second; of the cut-off frequency, ms of delay.
-    """
-    root = math.sqrt(len(index))
-    watched = 1e-9 * int((index.offsets.diff() > 0).sum()) * int(index.times.max() - index.times.min())
-    return {
-        "threshold_ratio": 2.0 / root,
-        "leak_rate": root / watched if watched else math.inf,
-        "cutoff_frequency": median_interval(index) / root,
-    }
-
-
 def median_interval(index: EventIndex) -> float:
     """Median time (ms) from an event to the next of its pixel, in which brightness changes by a threshold.
 

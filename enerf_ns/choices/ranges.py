@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from enerf_ns.dataparsers.recording.camera import LARGEST_SIDE
 from enerf_ns.dataparsers.recording.errors import FlagError
-from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, DEPTH_LIMITS, LONGEST_REFRACTORY_PERIOD
+from enerf_ns.dataparsers.recording.recording import DEPTH_LIMITS
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -94,14 +94,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "num_features": (1, 4096),
     "num_proposal_samples": (1, 2**16),
     "num_samples": (1, 2**16),
-    "contrast_thresholds": CONTRAST_THRESHOLD_LIMITS,
-    "refractory_period_ns": (0, LONGEST_REFRACTORY_PERIOD),
-    "leak_rate": (0.0, 1e6),
-    "cutoff_frequency": (1e-3, 1e9),
-    "least_delay": (0.0, 1e9),
-    "second_cutoff_frequency": (1e-3, 1e9),
-    "width": (1, 2**15),
-    "height": (1, 2**15),
     "event_loss_weight": WEIGHT,
     "no_event_loss_weight": WEIGHT,
     "no_event_margin": (0.0, 1.0),
@@ -117,7 +109,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "frame_delay_ms": (-100.0, 100.0),
     "focal_scale": (0.8, 1.2),
 }
-"""Lowest and highest value of each number, or of each of some numbers, by the name of its field in the config."""
+"""Lowest and highest value of each number, or of each of several numbers, by the name of its field in the config. The
+parts of the sensor have the ranges of their own settings."""
 
 WITHOUT_KEYS = ("collider_params", "gradient_accumulation_steps")
 """Dictionaries that are one flag each; of the others, each key is."""
@@ -132,15 +125,17 @@ WITHOUT_FLAG = (
 
 
 def check_ranges(config: TrainerConfig) -> None:
-    """Refuses a config that holds a number that is not finite, or one outside its range in `RANGES`.
+    """Refuses a config that holds a number that is not finite, or one outside its range.
 
     Raises:
         FlagError: Names the first such number as ns-train's flag.
     """
+    pipeline: Any = config.pipeline
+    ranges = RANGES | pipeline.model.sensor._target.ranges()
     for path, setting, values in _numbers((), "", config):
-        lowest, highest = RANGES.get(setting, (-math.inf, math.inf))
+        lowest, highest = ranges.get(setting, (-math.inf, math.inf))
         if not all(math.isfinite(value) and lowest <= value <= highest for value in values):
-            expected = f"from {lowest:.10g} to {highest:.10g}" if setting in RANGES else "finite"
+            expected = f"from {lowest:.10g} to {highest:.10g}" if setting in ranges else "finite"
             raise FlagError(f"{_flag(path)} is {_shown(values)}, but must be {expected}.")
     _check_order(config)
 

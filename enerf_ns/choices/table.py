@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from enerf_ns.choices.resolver import Choice
+from enerf_ns.choices.resolution import Choice
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.problems import find_problems

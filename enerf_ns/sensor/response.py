@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor, nn
+from torch import Tensor
 
 from enerf_ns.kernels.precision import full_precision
 
@@ -212,43 +212,3 @@ def pixel_brightness(
 ) -> Float[Tensor, "*batch"]:
     """Brightness that pixels see of three colour channels: each its own channel, or luma where that is None."""
     return luma(rgb) if channel is None else rgb.gather(-1, channel[..., None])[..., 0]
-
-
-KNOTS = 17
-"""Knots of a learned response, evenly over the log brightness that it starts as."""
-
-KNOTS_FROM_TO = (1e-3, 1.0)
-"""Brightness at the first and at the last knot."""
-
-
-class LearnedResponse(nn.Module):
-    """A monotone response that starts as a known one: of that one's log brightness a piecewise linear function, whose
-    slopes are positive and on average 1, since their mean is the sensor's contrast threshold.
-
-    Args:
-        start: The response before training.
-    """
-
-    def __init__(self, start: Response):
-        super().__init__()
-        self.start = start
-        self.name = f"learned:{start.name}"
-        first, last = (float(start(torch.tensor(b, dtype=torch.float64))) for b in KNOTS_FROM_TO)
-        self._first, self._step = first, (last - first) / (KNOTS - 1)
-        self.log_slopes = nn.Parameter(torch.zeros(KNOTS - 1))
-
-    def forward(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Log brightness; beyond the knots the first and the last slope go on."""
-        place = (self.start(brightness) - self._first) / self._step
-        slopes = torch.softmax(self.log_slopes, dim=0) * (KNOTS - 1)
-        values = torch.cat([slopes.new_zeros(1), slopes.cumsum(dim=0)])
-        knot = place.detach().floor().long().clamp(0, KNOTS - 2)
-        return self._first + self._step * (values[knot] + slopes[knot] * (place - knot))
-
-    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Linear brightness whose log brightness is the argument."""
-        place = (log_brightness - self._first) / self._step
-        slopes = torch.softmax(self.log_slopes, dim=0) * (KNOTS - 1)
-        values = torch.cat([slopes.new_zeros(1), slopes.cumsum(dim=0)])
-        knot = (torch.searchsorted(values, place.detach().contiguous(), right=True) - 1).clamp(0, KNOTS - 2)
-        return self.start.inverse(self._first + self._step * (knot + (place - values[knot]) / slopes[knot]))

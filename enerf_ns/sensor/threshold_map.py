@@ -1,12 +1,19 @@
-"""Contrast thresholds of single pixels, learned beside a field: how far each pixel's lie from the sensor's."""
+"""Deviations of the contrast thresholds of single pixels from those of the sensor, learned beside a field."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional
 
 import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor, nn
 
+from enerf_ns.dataparsers.sensor_estimates.estimates import threshold_spread
+from enerf_ns.events.batch import EventBatch
 from enerf_ns.kernels.precision import full_precision
+from enerf_ns.sensor.part import SensorChoices
+from enerf_ns.sensor.thresholds import Thresholds, ThresholdsConfig, chosen_thresholds, unknown_events
 
 SOLVED_EVERY = 50
 """Observations from one time that the map is solved to the next."""
@@ -124,3 +131,68 @@ class ThresholdMap(nn.Module):
         spread = (share * (solved.square() + errors)).sum(dim=0).sqrt()
         self.spread.copy_(torch.where(seen.any(dim=0), spread, self.spread).clamp(min=SMALLEST_SPREAD))
         self.deviations.copy_(solved.clamp(-LARGEST_DEVIATION, LARGEST_DEVIATION))
+
+
+@dataclass
+class PixelThresholdsConfig(ThresholdsConfig):
+    """Settings of the threshold map."""
+
+    learn_threshold_map: Optional[bool] = None  # noqa: UP045
+    """Learn the deviation of the thresholds of each pixel from those of the sensor. Default: yes if the recording does
+    not state the thresholds, and its events show that pixels differ."""
+
+
+class PixelThresholds(Thresholds):
+    """Pixels whose contrast thresholds differ, by a map that is learned."""
+
+    def __init__(self, config: PixelThresholdsConfig):
+        super().__init__(config)
+        self.threshold_map = None
+        if config.learn_threshold_map:
+            assert config.width is not None and config.height is not None
+            self.threshold_map = ThresholdMap(config.width * config.height)
+
+    @classmethod
+    def choose(cls, scene: SensorChoices) -> None:
+        """Decides whether the map is learned."""
+        name, index = "model.sensor.learn_threshold_map", scene.once(unknown_events)
+        spread = None if index is None else threshold_spread(index, scene.once(chosen_thresholds)[0])
+        kept = scene.use(name, lambda: spread is not None)
+        why = spread.why if spread else "events do not show that the thresholds of pixels differ"
+        value = "thresholds of each pixel are learned" if kept else ""
+        scene.row("threshold map", kept, value, scene.why(name, why), name)
+
+    def steps(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
+        """Log brightness by which the on events of each pair rise, and by which its off events fall; shape (pairs)."""
+        on, off = super().steps(batch)
+        if self.threshold_map is None:
+            return on, off
+        factors = self.threshold_map.factors(batch.pixels)
+        return on * factors[:, 0], off * factors[:, 1]
+
+    @torch.no_grad()
+    def observe(self, change: Float[Tensor, " pairs"], batch: EventBatch) -> None:
+        """Learns the map from what a training step rendered.
+
+        Args:
+            change: Rendered change of log brightness of each pair.
+            batch: The pairs and their events.
+        """
+        super().observe(change, batch)
+        if self.threshold_map is None:
+            return
+        fired, mean = batch.fired, self.mean_threshold
+        on, off = batch.on[fired], batch.off[fired]
+        c_on, c_off = (threshold / mean for threshold in self.contrast_thresholds)
+        factors = self.threshold_map.factors(batch.pixels[fired]) - 1.0
+        by_map = c_on * on * factors[:, 0] - c_off * off * factors[:, 1]
+        residual = (change[fired] - self.measured_change(batch)[fired]) / mean + by_map
+        self.threshold_map.observe(batch.pixels[fired], on, off, residual, (c_on, c_off))
+
+    def learned(self) -> dict[str, float]:
+        """Values of the sensor that were learned: with the relative spreads `spread_on` and `spread_off`."""
+        found = super().learned()
+        if self.threshold_map is not None:
+            on, off = self.threshold_map.spread.tolist()
+            found |= {"spread_on": on, "spread_off": off}
+        return found

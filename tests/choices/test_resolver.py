@@ -14,7 +14,9 @@ import yaml
 from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, small_config
 
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, recording_of_points, shaking
-from enerf_ns.choices.resolver import Choice, Resolution, is_colour, resolve
+from enerf_ns.choices.brightness import is_colour
+from enerf_ns.choices.resolution import Choice, Resolution
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
