@@ -1,4 +1,4 @@
-"""What numbers a run may be set to, checked before anything is read or written."""
+"""Ranges of the numbers in a config, checked before anything is read or written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MOST_STEPS = 10**9
 MOST_DRAWS = 2**24
-"""Most pairs, rays or samples that are drawn at once: beyond it, they fill any memory."""
+"""Largest number of pairs, rays or samples that are drawn at once; more would fill any memory."""
 
 COUNT, WEIGHT, LEARNING_RATE = (0, 10**9), (0.0, 1e6), (1e-12, 1.0)
 
@@ -105,7 +105,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "interlevel_loss_weight": WEIGHT,
     "near_plane": (0.0, 1e3),
     "init_density": (1e-6, 1e6),
-    "clock_ms": (-100.0, 100.0),  # of which more is another recording's
+    "clock_ms": (-100.0, 100.0),  # a larger delay means poses of another recording
     "frame_delay_ms": (-100.0, 100.0),
     "focal_scale": (0.8, 1.2),
 }
@@ -113,7 +113,7 @@ RANGES: dict[str, tuple[float, float]] = {
 parts of the sensor have the ranges of their own settings."""
 
 WITHOUT_KEYS = ("collider_params", "gradient_accumulation_steps")
-"""Dictionaries that are one flag each; of the others, each key is."""
+"""Dictionaries that are one flag each; of the others, each key is a flag."""
 
 WITHOUT_FLAG = (
     *("pipeline.defaults", "pipeline.resolution", "pipeline.datamanager.pixel_sampler", "pipeline.model.sensor.width"),
@@ -128,7 +128,7 @@ def check_ranges(config: TrainerConfig) -> None:
     """Refuses a config that holds a number that is not finite, or one outside its range.
 
     Raises:
-        FlagError: Names the first such number as ns-train's flag.
+        FlagError: Names the first such number by its flag of ns-train.
     """
     pipeline: Any = config.pipeline
     ranges = RANGES | pipeline.model.sensor._target.ranges()
@@ -141,10 +141,10 @@ def check_ranges(config: TrainerConfig) -> None:
 
 
 def _check_order(config: TrainerConfig) -> None:
-    """Refuses numbers that do not fit one another.
+    """Refuses numbers that contradict each other.
 
     Raises:
-        FlagError: Names their flags.
+        FlagError: Names the flags of such numbers.
     """
     pipeline: Any = config.pipeline
     parser, model = pipeline.datamanager.dataparser, pipeline.model
@@ -173,7 +173,13 @@ def _check_order(config: TrainerConfig) -> None:
 
 
 def _numbers(path: tuple[str, ...], setting: str, value: Any) -> Iterator[tuple[tuple[str, ...], str, list[Any]]]:
-    """Place, name of the field, and values of every number within a part of a config, which has this place and name."""
+    """Place, name of the field, and values of every number within a part of a config.
+
+    Args:
+        path: Place of the part within the config.
+        setting: Name of the field that holds the part.
+        value: The part.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from _numbers((*path, field.name), field.name, getattr(value, field.name))
@@ -187,7 +193,7 @@ def _numbers(path: tuple[str, ...], setting: str, value: Any) -> Iterator[tuple[
 
 
 def _flag(path: tuple[str, ...]) -> str:
-    """A setting as ns-train spells it; as the config does, where there is no flag for it."""
+    """The flag of ns-train for a setting, or its place within the config if it has no flag."""
     if ".".join(path).startswith(WITHOUT_FLAG):
         return ".".join(path)
     if path[:3] == ("pipeline", "datamanager", "dataparser"):

@@ -27,15 +27,16 @@ of full brightness, slider_depth comes out 1.2 dB worse, and its contrast 1.36 t
 times."""
 
 KNOTS = 17
-"""Knots of a learned response, evenly over the log brightness that it starts as."""
+"""Number of knots of a learned response, evenly spaced in the log brightness of the response that it starts from."""
 
 KNOTS_FROM_TO = (1e-3, 1.0)
 """Brightness at the first and at the last knot."""
 
 
 class LearnedResponse(nn.Module):
-    """A monotone response that starts as a known one: of that one's log brightness a piecewise linear function, whose
-    slopes are positive and on average 1, since their mean is the sensor's contrast threshold.
+    """A monotone response that starts as a known one: a piecewise linear function of the log brightness of that one.
+
+    Its slopes are positive and 1 on average, since the contrast threshold of the sensor sets their mean.
 
     Args:
         start: The response before training.
@@ -50,7 +51,7 @@ class LearnedResponse(nn.Module):
         self.log_slopes = nn.Parameter(torch.zeros(KNOTS - 1))
 
     def forward(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Log brightness; beyond the knots the first and the last slope go on."""
+        """Log brightness; beyond the knots the first and the last slope continue."""
         place = (self.start(brightness) - self._first) / self._step
         slopes = torch.softmax(self.log_slopes, dim=0) * (KNOTS - 1)
         values = torch.cat([slopes.new_zeros(1), slopes.cumsum(dim=0)])

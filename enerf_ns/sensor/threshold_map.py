@@ -16,13 +16,13 @@ from enerf_ns.sensor.part import SensorChoices
 from enerf_ns.sensor.thresholds import Thresholds, ThresholdsConfig, chosen_thresholds, unknown_events
 
 SOLVED_EVERY = 50
-"""Observations from one time that the map is solved to the next."""
+"""Observations between two solutions of the map."""
 
 FIRST_SPREAD = 0.05
-"""Relative standard deviation of thresholds from pixel to pixel that is assumed before anything is observed."""
+"""Relative standard deviation of thresholds from pixel to pixel before anything is observed."""
 
 SMALLEST_SPREAD = 1e-3
-"""Least standard deviation that is believed, so that a map can grow again."""
+"""Smallest standard deviation, from which a map can still grow."""
 
 LARGEST_DEVIATION = 0.5
 """Largest deviation of a threshold, as a share of the sensor's."""
@@ -31,20 +31,20 @@ LARGEST_DEVIATION = 0.5
 class ThresholdMap(nn.Module):
     """Relative deviations of the on and off thresholds of each pixel, by a regression that runs along with training.
 
-    What a pair of instants of a pixel should change by is C_on (1 + d_on) n_on - C_off (1 + d_off) n_off; the residual
-    between what a field renders and the same with d = 0 is linear in both deviations. Each pixel keeps the normal
-    equations of its own two numbers, robustly weighted as the Huber loss is, and in inverse proportion to the variance
-    of residuals at that time; an observation counts as the square of its number, so that those of a field that was not
-    yet learnt fade. A ridge draws the deviations to 0: its strength is the deviations' own variance, which is estimated
-    from all pixels (empirical Bayes), so that a sensor whose pixels are alike gets none. The mean over the pixels stays
-    0, since that belongs to the sensor's thresholds. What a pixel's own events tell of the difference of both
-    deviations (`start_from`) is one more equation.
+    The log brightness of a pixel with n_on and n_off events should change by
+    C_on (1 + d_on) n_on - C_off (1 + d_off) n_off. The residual between a rendered change and this change at d = 0 is
+    linear in both deviations d. Each pixel keeps the normal equations of its two deviations. An observation is weighted
+    robustly, as in the Huber loss, by the inverse variance of the residuals at that time, and by the square of its
+    number, so that observations of an early field fade. A ridge draws the deviations to 0. Its strength comes from the
+    variance of the deviations of all pixels (empirical Bayes), so that a sensor whose pixels are alike gets no map. The
+    mean over the pixels stays 0, since it belongs to the thresholds of the sensor. The events of a pixel alone determine
+    the difference of its deviations (`start_from`), which is one more equation.
 
-    Nothing here has a gradient or a learning rate; everything is stored with the run, but for what it started from,
-    which whoever trains tells it again.
+    The map has no gradient and no learning rate. It is stored with the run, but without the equations that it started
+    from: the pipeline sets these again.
 
     Args:
-        num_pixels: Of the sensor.
+        num_pixels: Number of pixels of the sensor.
     """
 
     products: Tensor
@@ -65,16 +65,16 @@ class ThresholdMap(nn.Module):
         self._observed = 0
 
     def factors(self, pixels: Int64[Tensor, " pairs"]) -> Float[Tensor, "pairs 2"]:
-        """What the on and off thresholds of pixels are multiplied by."""
+        """Factors of the on and off thresholds of pixels."""
         return 1.0 + self.deviations[pixels]
 
     @torch.no_grad()
     def start_from(self, difference: Float[Tensor, " pixels"], variance: Float[Tensor, " pixels"]) -> None:
-        """Takes in what is known beforehand, which is not stored with the run.
+        """Adds an estimate from before training, which is not stored with the run.
 
         Args:
             difference: Deviation of the on threshold less that of the off threshold.
-            variance: Of that; infinite where nothing is known.
+            variance: Variance of the difference; infinite for pixels without an estimate.
         """
         self.known = torch.stack([1.0 / variance, difference / variance], dim=-1).to(self.deviations.device)
         self._solve()
@@ -89,13 +89,13 @@ class ThresholdMap(nn.Module):
         residual: Float[Tensor, " pairs"],
         shares: tuple[float | Tensor, float | Tensor],
     ) -> None:
-        """Takes in what a step showed, but for residuals that are not finite.
+        """Adds the pairs of a step. Residuals that are not finite are passed over.
 
         Args:
-            pixels: Of pairs, y * width + x.
+            pixels: Pixels of the pairs, y * width + x.
             on, off: Numbers of their events.
-            residual: Rendered change of log brightness less what the events add up to at the sensor's thresholds, in
-                mean thresholds.
+            residual: Rendered change of log brightness less the sum of the events at the sensor's thresholds, in mean
+                thresholds.
             shares: The sensor's on and off threshold, in mean thresholds.
         """
         is_finite = residual.isfinite()
@@ -116,7 +116,7 @@ class ThresholdMap(nn.Module):
             self._solve()
 
     def _solve(self) -> None:
-        """Deviations from the normal equations, and how far they spread from what they and their errors are."""
+        """Solves the normal equations for the deviations, and estimates their spread from them and their errors."""
         weight, weighted = self.known.unbind(dim=-1)
         equations = torch.stack([weight, -weight, weight, weighted, -weighted], dim=-1)
         aa, ab, bb, ar, br = (self.products / self.number.clamp(min=1.0).square() + equations).unbind(dim=-1)

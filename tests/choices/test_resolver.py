@@ -235,7 +235,7 @@ def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recor
 
     assert chosen("events", None, unknown)[1].startswith("logarithm:0.01; pixels see the logarithm of brightness")
     learned, said = chosen("events+frames", None, unknown)
-    assert learned and "learned, starting from linlog" in said and "frames tell it better" in said
+    assert learned and "learned, starting from linlog" in said and "frames determine it better" in said
     for supervision, response, made in (
         ("events", None, unknown),
         ("events+frames", "logarithm:0.1", unknown),
@@ -352,7 +352,7 @@ def test_a_delay_of_less_than_a_twentieth_of_the_time_between_events_is_none(rec
         (
             {"cutoff_frequency": 100.0, "learn_cutoff_frequency": True},
             "bandwidth",
-            "how far pixels lag behind brightness is learned",
+            "the lag of pixels behind brightness is learned",
         ),
         ({"second_cutoff_frequency": 200.0}, "second stage", "pixels lag by 0.796 ms more"),
     ],

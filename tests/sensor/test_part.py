@@ -1,4 +1,4 @@
-"""A part is added to a sensor as docs/extending.md says: one class, its settings, and an entry in the lists of bases."""
+"""A part is added to a sensor as docs/extending.md says: a class, its settings, and both in the lists of bases."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def test_a_recording_too_short_to_tell_a_parameter_keeps_what_it_starts_from(
     found = resolve(config, recording)
     rows = {row.part: row for row in found.choices}
     assert rows["leak"].kept == found.values["model.sensor.learn_leak_rate"] == is_long
-    assert f"{len(index_events(recording)):,} events tell it within" in rows["leak"].why
+    assert f"{len(index_events(recording)):,} events determine it within" in rows["leak"].why
     assert found.values["model.sensor.learn_threshold_ratio"] == is_long
     for part in ("leak", "threshold per polarity"):
         assert ("too few" in rows[part].why) != is_long
