@@ -34,30 +34,20 @@ PARTS = {"clock": "clock of the poses", "mount": "mount", "lens": "lens", "drift
 """Names of the rows of what is refined, by the names of their settings."""
 
 
-def selected_time(scene: Scene) -> None:
-    """Which part of the recording is used? Selects it; this has no row."""
+def selection(scene: Scene) -> None:
+    """Which part of the recording is used, and are its poses smoothed? `noise` has the row."""
     scene.use(f"{DATAPARSER}.train_frames", lambda: "blurred")
-    scene.use(f"{DATAPARSER}.time_range", lambda: None)
-
-
-def smooth_poses(scene: Scene) -> None:
-    """Are the poses smoothed? Selects the part of the recording that is used; the row is `noise`."""
+    time_range = scene.use(f"{DATAPARSER}.time_range", lambda: None)
     parser, whole = scene.parser, scene.recording
-    selection = (
-        scene.value(f"{DATAPARSER}.time_range"),
-        parser.keep_hot_pixels,
-        parser.keep_pose_gaps,
-        parser.undistort,
-    )
-    scene.recording = whole.selected(*selection)
+    selected = time_range, parser.keep_hot_pixels, parser.keep_pose_gaps, parser.undistort
+    scene.recording = whole.selected(*selected)
+    found = scene.once(noise_of_poses)  # before they are smoothed
 
     def is_noisy() -> bool:
-        found = scene.once(noise_of_poses)
         return found is not None and _pixels(scene, found) > LARGEST_NOISE
 
-    scene.once(noise_of_poses)  # before they are smoothed
     if scene.use(f"{DATAPARSER}.smooth_poses", is_noisy):
-        scene.recording = whole.selected(*selection, smooth_poses=True)
+        scene.recording = whole.selected(*selected, smooth_poses=True)
 
 
 def pose_gaps(scene: Scene) -> None:

@@ -18,8 +18,7 @@ from enerf_ns.choices.scene import Scene
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 ROWS: tuple[Callable[[Scene], None], ...] = (
-    poses.selected_time,
-    poses.smooth_poses,
+    poses.selection,
     frames.split,
     poses.pose_gaps,
     events.held_out_events,

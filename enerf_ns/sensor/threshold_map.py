@@ -37,8 +37,8 @@ class ThresholdMap(nn.Module):
     robustly, as in the Huber loss, by the inverse variance of the residuals at that time, and by the square of its
     number, so that observations of an early field fade. A ridge draws the deviations to 0. Its strength comes from the
     variance of the deviations of all pixels (empirical Bayes), so that a sensor whose pixels are alike gets no map. The
-    mean over the pixels stays 0, since it belongs to the thresholds of the sensor. The events of a pixel alone determine
-    the difference of its deviations (`start_from`), which is one more equation.
+    mean over the pixels stays 0, since it belongs to the thresholds of the sensor. The events of a pixel alone
+    determine the difference of its deviations (`start_from`), which is one more equation.
 
     The map has no gradient and no learning rate. It is stored with the run, but without the equations that it started
     from: the pipeline sets these again.

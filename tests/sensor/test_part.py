@@ -47,7 +47,7 @@ class DarkCurrent(SensorPart):
         return super().brightness(rgb, pixels) + self.dark
 
     def learned(self) -> dict[str, float]:
-        return super().learned() | ({"dark_current": float(self.dark)} if isinstance(self.dark, Tensor) else {})
+        return super().learned() | ({"dark_current": float(self.dark.detach())} if isinstance(self.dark, Tensor) else {})
 
 
 class DarkSensor(DarkCurrent, SensorModel):
