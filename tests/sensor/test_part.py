@@ -47,7 +47,10 @@ class DarkCurrent(SensorPart):
         return super().brightness(rgb, pixels) + self.dark
 
     def learned(self) -> dict[str, float]:
-        return super().learned() | ({"dark_current": float(self.dark.detach())} if isinstance(self.dark, Tensor) else {})
+        found = super().learned()
+        if isinstance(self.dark, Tensor):
+            found["dark_current"] = float(self.dark.detach())
+        return found
 
 
 class DarkSensor(DarkCurrent, SensorModel):
