@@ -105,9 +105,8 @@ def learn(
 ) -> SensorModel:
     """Trains the sensor alone, with the learning rates of the method, which fall to a tenth; told makes of a batch what
     it is told of it."""
-    groups = [
-        {"params": group, "lr": sensor.learning_rates()[name]} for name, group in sensor.get_param_groups().items()
-    ]
+    rates = sensor.learning_rates()
+    groups = [{"params": group, "lr": rates[name]} for name, group in sensor.get_param_groups().items()]
     adam = torch.optim.Adam(groups) if groups else None
     drawn = Drawn(index, 0, mode)
     supervision = EventSupervision("huber", 1.0, 0.1, 0.0)
