@@ -19,7 +19,8 @@ import torch
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.events.samplers import EventPairSampler
-from enerf_ns.sensor.sensor_model import GREY, SensorModelConfig
+from enerf_ns.sensor.part import GREY
+from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings

@@ -1,4 +1,4 @@
-"""What a recording tells of its sensor before anything is learnt: each parameter with its standard error."""
+"""Estimates of sensor parameters from a recording, before training, each with its standard error."""
 
 from __future__ import annotations
 
@@ -17,91 +17,93 @@ from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, 
 from enerf_ns.dataparsers.sensor_estimates.frame_contrast import thresholds_from_frames
 
 ASSUMED_THRESHOLD = 0.25
-"""Mean threshold assumed where no frames tell it. Events fix brightness only up to this factor."""
+"""Mean threshold that is assumed if no frames determine it. Events determine log brightness only up to this factor."""
 
 SAMPLED_EVENTS = 2**21
-"""Most events looked at, those of pixels evenly taken."""
+"""Largest number of events that are used: the events of evenly spaced pixels."""
 
 FEWEST_INTERVALS = 10_000
-"""Fewest intervals between events of one pixel that tell whether there is a refractory period."""
+"""Smallest number of intervals between events of one pixel that show whether there is a refractory period."""
 
 SHARP_EDGE = 1.25
 """Largest ratio between quantiles of the intervals in which brightness goes on that a refractory period explains; see
-`refractory_period`. In simulated recordings without one it is 1.1 to 6, with one that pixels feel at most 1.18."""
+`refractory_period`. It is 1.1 to 6 in simulated recordings without a period, and at most 1.18 in simulated recordings
+with a period that causes many misses."""
 
 LARGEST_TURN = 1.6
 """Largest ratio between the shortest intervals in which brightness turns back and those in which it goes on that a
-refractory period explains: 2.2 to 17 in simulated recordings without one, 1 with one where brightness is fast, and up
-to 1.3 where it is so slow that pixels take half of that time again to their next event."""
+refractory period explains. It is 2.2 to 17 in simulated recordings without a period. With a period it is 1 for fast
+brightness, and up to 1.3 for brightness so slow that pixels take half of the period again until their next event."""
 
 PERIOD_ERROR = 0.01
-"""Relative error of the refractory period that is always there; see `refractory_period`."""
+"""Smallest relative error of the refractory period; see `refractory_period`."""
 
 WINDOWS = tuple(round(8 * 2 ** (i / 2)) for i in range(24))
-"""Numbers of successive events of a pixel that are summed; over fewer, the scene alone makes the sum grow."""
+"""Numbers of successive events of a pixel that are summed. Over fewer events, the scene alone makes the sum grow."""
 
 FEWEST_PIXELS, LEAST_SHARE = 200, 0.1
-"""Fewest pixels that have as many events as are summed, and least share of those that have any: the few that have most
-are odd ones."""
+"""Smallest number of pixels with as many events as are summed, and smallest share of the pixels with any. The few
+pixels with the most events are unusual."""
 
 BALANCE_ERROR = 0.01
-"""Relative error of thresholds by counts that is always there: leak adds on events, a scene may brighten as a whole."""
+"""Smallest relative error of thresholds from counts: a leak adds on events, and a scene may brighten as a whole."""
 
 SPREAD_ERROR = 0.08
-"""Relative error of the spread of thresholds that is always there: what it makes of a scene's own growth."""
+"""Smallest relative error of the spread of thresholds, from the growth that the scene itself causes."""
 
 GROUPS = 16
-"""Parts of the sensor, each left out once (jackknife) to find errors."""
+"""Parts of the sensor, each left out once for standard errors (jackknife)."""
 
-TOLD = 3.0
-"""Standard errors from 0 at which a parameter is told from 0."""
+SIGNIFICANT = 3.0
+"""Standard errors from 0 beyond which a parameter differs from 0 significantly."""
 
 LEAST_GROWTH = 0.5
-"""Least share of the variance of the longest sums that a spread of thresholds must make to be told: a scene makes it
-grow by some tenths."""
+"""Smallest share of the variance of the longest sums that a spread of thresholds must cause to be identifiable. A scene
+causes some tenths of it."""
 
 
 FEWEST_SLOPE = 16
-"""Fewest events of a pixel whose sum has a slope that tells anything."""
+"""Smallest number of events of a pixel for which the slope of their sum is used."""
 
 FIRST_DIFFERENCE = 0.05
-"""Standard deviation of the relative difference of a pixel's thresholds, before anything is known of it."""
+"""Prior standard deviation of the relative difference of a pixel's thresholds."""
 
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the square of a normal deviate of variance 1."""
 
 PIXELS_AT_ONCE = 2**12
-"""Pixels whose events are looked at together."""
+"""Pixels whose events are processed together."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter of the sensor as the recording tells it."""
+    """An estimate of a parameter of the sensor."""
 
     value: float
     error: float
-    """Its standard error, in the same unit; infinite where it is only assumed."""
+    """Standard error in the same unit; infinite for a value that is assumed."""
     why: str
-    """Half a sentence that can follow "because", with the numbers it rests on."""
+    """Half a sentence that can follow "because", with the numbers that the estimate rests on."""
 
 
 def refractory_period(index: EventIndex) -> Estimate | None:
-    """For how long (ns) a pixel is blind after an event, where events show it.
+    """Time (ns) for which a pixel is blind after an event, if the events show it.
 
-    The shortest intervals between events of one pixel then end at a sharp edge (low quantiles lie close together),
-    which is nearly the same whether brightness went on or turned back; without it, intervals in which it turns back are
-    several times as long. Quantiles and not the shortest interval, which jitter and read-out set. The edge is taken
-    from the quantiles of 0.1 and 0.3 % of those in which brightness goes on, in a straight line to 0 %. Even the
-    fastest brightness takes some time from the end of blindness to the next threshold; how much is told by how much
-    longer turning back takes than going on, a quarter of which is taken off. The error is half of that difference, half
-    of what lies between the edge and the quantile of 1 %, and 1 %. Of 8 ms, 8.0 to 8.1 ms is found of simulated fast
-    brightness, 7.6 to 10.6 ms of slow.
+    With a refractory period, the intervals between events of one pixel have a sharp lower edge: low quantiles lie close
+    together. The edge is nearly the same for intervals in which brightness goes on and in which it turns back. Without
+    a period, intervals in which brightness turns back are several times as long. Quantiles are used, since jitter and
+    read-out set the shortest interval. The edge is the straight line through the quantiles of 0.1 and 0.3 % of the
+    intervals in which brightness goes on, at 0 %. Even the fastest brightness takes some time from the end of the
+    period to the next threshold. The difference between turning back and going on measures this time; a quarter of it
+    is subtracted. The error combines half of that difference, half of the distance from the edge to the quantile of
+    1 %, and 1 %. In simulations with a period of 8 ms, the estimate is 8.0 to 8.1 ms for fast brightness and 7.6 to
+    10.6 ms for slow brightness.
 
     Args:
         index: On the CPU.
 
     Returns:
-        None where events show none: there is no edge, or too few of them are closer together than the motion makes
+        None if the events show no period: there is no edge, or too few intervals are shorter than the motion makes
         them.
     """
     times, is_on, follows = _sampled(index)
@@ -131,14 +133,14 @@ def share_closer(index: EventIndex, time: int) -> float:
 def contrast_thresholds(recording: EventRecording, blind_for: int) -> tuple[Estimate, Estimate, bool]:
     """C_on and C_off, and whether their mean was measured.
 
-    From frames of the camera of the events, where there are some (`thresholds_from_frames`). Else their mean is
-    `ASSUMED_THRESHOLD`, and the errors are of what is told, their ratio: over a long recording every pixel's changes
-    nearly cancel, so (on events) C_on = (off events) C_off. Not so for a sensor with a refractory period, which misses
-    more of the faster changes, and these are not as often of either polarity (counts are off by 1.2 to 1.65 in
-    simulated recordings): then the thresholds are assumed to be equal, with infinite error.
+    Frames of the same camera determine both (`thresholds_from_frames`). Without them, the mean is `ASSUMED_THRESHOLD`,
+    and the errors are those of the ratio. Over a long recording the changes of every pixel nearly cancel, so that
+    (on events) C_on = (off events) C_off. A sensor with a refractory period misses more of the faster changes, which
+    are not equally often of either polarity: the ratio of counts is wrong by a factor of 1.2 to 1.65 in simulated
+    recordings. The thresholds of such a sensor are assumed to be equal, with infinite error.
 
     Args:
-        recording: Its index is made if it is not there yet.
+        recording: The recording; its index is made if it does not exist.
         blind_for: The refractory period, ns; 0 for none.
 
     Raises:
@@ -171,15 +173,16 @@ def contrast_thresholds(recording: EventRecording, blind_for: int) -> tuple[Esti
 def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]) -> Estimate | None:
     """Relative standard deviation of thresholds from pixel to pixel.
 
-    It makes the variance of a pixel's sum of events grow with the square of their number, while the brightness of a
-    scene is bounded and noise makes it grow with the number.
+    A spread makes the variance of a pixel's sum of events grow with the square of their number. The brightness of a
+    scene is bounded, and noise makes the variance grow with the number.
 
     Args:
         index: On the CPU.
         contrast_thresholds: C_on and C_off; only their ratio matters.
 
     Returns:
-        None where it cannot be told from 0, or from what a sensor with a refractory period misses.
+        None if it does not differ from 0 significantly, or if the sensor has a refractory period, whose misses look
+        alike.
     """
     if refractory_period(index) is not None:
         return None
@@ -188,7 +191,7 @@ def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]
         return None
     square, error = growth.values[2], growth.errors[2]
     share = square * growth.squares / growth.variance
-    if square < TOLD * error or share < LEAST_GROWTH:
+    if square < SIGNIFICANT * error or share < LEAST_GROWTH:
         return None
     spread = math.sqrt(square)
     why = (
@@ -199,15 +202,15 @@ def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]
 
 
 def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float]) -> Estimate:
-    """Growth of the variance of a pixel's sum of events with each of them, in squared mean thresholds: the part that
-    grows with their number as a random walk does.
+    """Variance that noise adds to a pixel's sum of events with each event, in squared mean thresholds: the part of the
+    variance that grows with the number of events, as in a random walk.
 
     Args:
         index: On the CPU.
         contrast_thresholds: C_on and C_off; only their ratio matters.
 
     Returns:
-        0 with infinite error where pixels have too few events.
+        0 with infinite error if pixels have too few events.
     """
     growth = _growth(index, contrast_thresholds, with_spread=refractory_period(index) is None)
     if growth is None:
@@ -220,16 +223,17 @@ def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float])
 
 
 def scene_variance(index: EventIndex, contrast_thresholds: tuple[float, float], noise: float) -> float:
-    """Largest variance of a pixel's sum of events over any number of them, in squared mean thresholds, less what noise
-    adds: how far apart a pixel sees a scene's log brightness.
+    """Variance of the log brightness of a scene that a pixel sees, in squared mean thresholds.
+
+    It is the largest variance of a pixel's sum of events over any number of them, less the variance that noise adds.
 
     Args:
         index: On the CPU.
         contrast_thresholds: C_on and C_off; only their ratio matters.
-        noise: What noise adds to the variance of a sum with each event (`noise_per_event`).
+        noise: Variance that noise adds with each event (`noise_per_event`).
 
     Returns:
-        0 where pixels have too few events.
+        0 if pixels have too few events.
     """
     growth = _growth(index, contrast_thresholds, with_spread=False)
     return 0.0 if growth is None else max(float((growth.variances - noise * growth.lengths).max()), 0.0)
@@ -238,32 +242,32 @@ def scene_variance(index: EventIndex, contrast_thresholds: tuple[float, float], 
 def threshold_differences(
     index: EventIndex, contrast_thresholds: tuple[float, float], noise: float
 ) -> tuple[Float32[Tensor, " pixels"], Float32[Tensor, " pixels"]]:
-    """By how much the on threshold of each pixel deviates more than its off threshold, as its events tell.
+    """Relative deviation of the on threshold of each pixel less that of its off threshold, from its events.
 
-    A pixel whose on threshold is higher, relative to the sensor's, than its off threshold fires too few on events: the
-    running sum of its events falls as they go on, while brightness comes and goes. So the difference is the slope of
-    the sum (least squares) over the events, in thresholds. A leak adds to it in proportion to time, a wrong ratio of
-    the sensor's thresholds everywhere alike: both are fitted to the slopes of all pixels, and taken off. How far
-    brightness itself makes slopes differ, which falls with the cube of the number of events, is told by those of the
-    first and the second half of the events of each pixel.
+    A pixel with a relatively high on threshold fires too few on events, so that the running sum of its events falls,
+    while brightness comes and goes. The difference is therefore the slope of that sum over the events (least squares),
+    in thresholds. A leak adds a slope in proportion to time, and a wrong ratio of the sensor's thresholds adds the same
+    slope everywhere: both are fitted to the slopes of all pixels, and subtracted. Brightness itself makes slopes differ
+    by an amount that falls with the cube of the number of events. The slopes of the first and the second half of the
+    events of each pixel give this amount.
 
     Args:
         index: On the CPU, of a sensor without a refractory period, during which changes are missed.
         contrast_thresholds: C_on and C_off; only their ratio matters.
-        noise: What noise adds to the variance of a sum with each event (`noise_per_event`).
+        noise: Variance that noise adds with each event (`noise_per_event`).
 
     Returns:
-        The relative difference, and its variance; 0 and infinity of pixels with fewer than `FEWEST_SLOPE` events.
+        The relative difference, and its variance; 0 and infinity for pixels with fewer than `FEWEST_SLOPE` events.
     """
     on, off = (threshold / (0.5 * sum(contrast_thresholds)) for threshold in contrast_thresholds)
     parts = [_sums_for_slopes(index, on, off, first) for first in range(0, len(index.offsets) - 1, PIXELS_AT_ONCE)]
     halves = np.concatenate(parts, axis=1)  # sums, pixels, halves
     number = halves[0].sum(1)
-    told = number >= FEWEST_SLOPE
+    enough = number >= FEWEST_SLOPE
     difference, variance = np.zeros(len(number)), np.full(len(number), np.inf)
-    if told.any():
-        slopes, (first, second) = _slopes(halves.sum(2)[:, told]), _slopes(halves[:, told]).T
-        n = number[told]
+    if enough.any():
+        slopes, (first, second) = _slopes(halves.sum(2)[:, enough]), _slopes(halves[:, enough]).T
+        n = number[enough]
         # a random walk's slope over n steps has a variance of 1.2 of a step's over n; m grows by a half with each
         scatter = float(np.median((second - first) ** 2 * n**3)) / MEDIAN_OF_SQUARES
         scene = max(scatter / 16 - 1.2 * noise * float(np.median(n**2)), 0.0)
@@ -271,13 +275,13 @@ def threshold_differences(
         common = np.stack([np.ones(len(n)), 1 / n], axis=1)
         weight = 1 / np.sqrt(spread + FIRST_DIFFERENCE**2)
         fitted = np.linalg.lstsq(common * weight[:, None], slopes * weight, rcond=None)[0]
-        difference[told], variance[told] = common @ fitted - slopes, np.maximum(spread, 1e-8)
+        difference[enough], variance[enough] = common @ fitted - slopes, np.maximum(spread, 1e-8)
     return torch.from_numpy(difference).float(), torch.from_numpy(variance).float()
 
 
 def _sums_for_slopes(index: EventIndex, on: float, off: float, first: int) -> Float64[np.ndarray, "5 pixels 2"]:
-    """Of the halves of the events of some pixels: their number, and sums of m, y, m * m and m * y, with y the sum of
-    the events of the pixel so far, in mean thresholds, and m half of what they sum to without their signs."""
+    """Number, and sums of m, y, m * m and m * y, over each half of the events of some pixels. y is the sum of the
+    events of the pixel so far, in mean thresholds; m is half of their sum without signs."""
     offsets = index.offsets[first : first + PIXELS_AT_ONCE + 1]
     begin, end = int(offsets[0]), int(offsets[-1])
     counts = offsets.diff()
@@ -294,32 +298,9 @@ def _sums_for_slopes(index: EventIndex, on: float, off: float, first: int) -> Fl
 
 
 def _slopes(sums: Float64[np.ndarray, "5 *sets"]) -> Float64[np.ndarray, "*sets"]:
-    """Of y over m by least squares, from their number and their sums."""
+    """Slopes of y over m by least squares, from their number and their sums."""
     number, m, y, mm, my = sums
     return (number * my - m * y) / np.maximum(number * mm - m * m, 1e-12)
-
-
-def errors_of_learning(index: EventIndex) -> dict[str, float]:
-    """Standard errors with which events can tell a sensor's parameters to who knows all else, roughly.
-
-    Each event tells by how much brightness changed to about one threshold, independently of the others. So the ratio of
-    thresholds shows as 2 / sqrt(events); a leak as the square root of their number over the time that all pixels were
-    watched (as any rate); and a delay as a shift by a threshold in the median interval between a pixel's events,
-    divided by sqrt(events).
-
-    Args:
-        index: On the CPU.
-
-    Returns:
-        Of the threshold ratio, relative; of the leak rate, on events a second; of the cut-off frequency, ms of delay.
-    """
-    root = math.sqrt(len(index))
-    watched = 1e-9 * int((index.offsets.diff() > 0).sum()) * int(index.times.max() - index.times.min())
-    return {
-        "threshold_ratio": 2.0 / root,
-        "leak_rate": root / watched if watched else math.inf,
-        "cutoff_frequency": median_interval(index) / root,
-    }
 
 
 def median_interval(index: EventIndex) -> float:
@@ -329,7 +310,7 @@ def median_interval(index: EventIndex) -> float:
         index: On the CPU.
 
     Returns:
-        Infinity where no pixel has two events.
+        Infinity if no pixel has two events.
     """
     times, _, follows = _sampled(index)
     return 1e-6 * float(np.median(np.diff(times)[follows])) if follows.any() else math.inf
@@ -340,7 +321,7 @@ class _Growth:
     """How the variance of sums of events grows with their number, in squared mean thresholds."""
 
     values: Float64[np.ndarray, "3"]
-    """What does not grow, what each event adds, and squared spread."""
+    """Constant variance, variance that each event adds, and squared spread."""
     errors: Float64[np.ndarray, "3"]
     longest: int
     """Number of events of the longest sums."""
@@ -349,7 +330,7 @@ class _Growth:
     variance: float
     """Variance of the longest sums."""
     squares: float
-    """What a squared spread of 1 would add to it."""
+    """Variance that a squared spread of 1 would add to the longest sums."""
     lengths: Int64[np.ndarray, " windows"]
     """Numbers of events that are summed."""
     variances: Float64[np.ndarray, " windows"]
@@ -357,7 +338,7 @@ class _Growth:
 
 
 def _growth(index: EventIndex, contrast_thresholds: tuple[float, float], with_spread: bool) -> _Growth | None:
-    """Sums of the number of events of `WINDOWS`, and a fit with coefficients of at least 0 to their variance."""
+    """The growth of the sums of `WINDOWS` events, by a fit to their variance with coefficients of at least 0."""
     on, off = np.array(contrast_thresholds) / np.mean(contrast_thresholds)
     times, is_on, follows = _sampled(index)
     pixel = np.concatenate([[0], np.cumsum(~follows)])
@@ -420,14 +401,14 @@ def _sampled(
 
 
 def _balanced(num_on: Int64[np.ndarray, " sets"], num_off: Int64[np.ndarray, " sets"]) -> Float64[np.ndarray, "2 sets"]:
-    """C_on and C_off under which events of both polarities cancel; neither below the least that there is."""
+    """C_on and C_off under which events of both polarities cancel, both at least the smallest threshold."""
     both, least = 2 * ASSUMED_THRESHOLD, CONTRAST_THRESHOLD_LIMITS[0]
     on = np.clip(both * num_off / np.maximum(num_on + num_off, 1), least, both - least)
     return np.stack([on, both - on])
 
 
 def _jackknife(without: Float64[np.ndarray, "values groups"]) -> Float64[np.ndarray, " values"]:
-    """Standard errors of values from what they are without each group."""
+    """Standard errors of values, from the values without each group (jackknife)."""
     groups = without.shape[1]
     return np.sqrt((groups - 1) / groups * ((without - without.mean(1, keepdims=True)) ** 2).sum(1))
 

@@ -1,5 +1,5 @@
-"""What frames of the same camera tell that events leave open: contrast thresholds, which an event is worth in log
-brightness, and the level of brightness."""
+"""Estimates from frames of the same camera of what events leave open: contrast thresholds and the level of
+brightness."""
 
 from __future__ import annotations
 
@@ -18,87 +18,91 @@ from enerf_ns.dataparsers.recording.picture_depth import brightness
 from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording, Frames
 
 DARKEST, BRIGHTEST = 20, 245
-"""Grey levels from and up to which pixels of frames are used: darker ones are rounded by more than 2.5 %, and not all
-responses are logarithms there; brighter ones may be saturated."""
+"""Darkest and brightest grey level of the pixels of frames that are used. Darker levels are rounded by more than 2.5 %,
+and not all responses are logarithms there; brighter ones may be saturated."""
 
 LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in what a grey sensor sees (ITU-R BT.601)."""
+"""Weights of red, green and blue in the brightness that a grey sensor sees (ITU-R BT.601)."""
 
 NUM_STARTS = 24
-"""Most frames that others are compared to."""
+"""Largest number of frames that others are compared to."""
 
 SAMPLED_PIXELS = 2**15
-"""Most pixels of a frame that are compared, evenly taken."""
+"""Largest number of pixels of a frame that are compared, evenly spaced."""
 
 EVENTS_BETWEEN = 0.25
-"""Fewest events of a pixel on average between the frames that are compared: with fewer, hardly any tells something."""
+"""Smallest mean number of events of a pixel between the frames that are compared; fewer carry little information."""
 
 FEWEST_NEIGHBOURS = 4
-"""Fewest of the eight pixels around one whose changes must be known."""
+"""Smallest number of the eight pixels around one whose changes must be known."""
 
 GONE_ON = 0.35
-"""Thresholds by which log brightness has gone on since the last event, in its direction, where it changes from frame to
-frame; of simulated recordings of ideal sensors, thresholds are then right within 3 %."""
+"""Thresholds by which log brightness has gone on since the last event, in its direction. With this value, the estimated
+thresholds of simulated recordings of ideal sensors are right within 3 %."""
 
 FAINTEST = 0.01
-"""Brightness up to which nothing counts in a mean of log brightness: how black what is black is, nobody knows."""
+"""Brightness up to which pixels are left out of a mean of log brightness, since the logarithm of black is unknown."""
 
 FEWEST_ROWS = 1000
-"""Fewest changes of a pixel between frames that thresholds are fitted to."""
+"""Smallest number of changes of a pixel between frames that thresholds are fitted to."""
 
 FEWEST_QUIET, EXPOSURE_CHANGES = 200, 0.02
-"""Fewest pixels without events between two frames that tell how exposure changed, and by how much, of log brightness,
-it must from frame to frame to be one that changes: of 12 simulated recordings with one exposure, and of slider_depth,
-0.011 was the most; of an exposure that wanders by 40 % within a second, with 41 frames, it is 0.04."""
+"""Smallest number of pixels without events between two frames that determine the change of exposure, and smallest
+change of log brightness from frame to frame at which an exposure counts as changing. The change was at most 0.011 in 12
+simulated recordings with a constant exposure and in slider_depth. It is 0.04 for an exposure that wanders by 40 %
+within a second, with 41 frames."""
 
 TAKEN_OFF = 0.04
-"""Such a change from which on thresholds are measured without it; a smaller one harms them less than taking it off."""
+"""Smallest such change that is subtracted before thresholds are measured; a smaller one harms them less than the
+subtraction."""
 
 INSTANTS = 5
 """Instants of an exposure at which events are counted."""
 
 MODEL_ERROR, BLURRED_ERROR = 0.03, 0.08
-"""Relative error that is always there, of sharp and of blurred frames; see `thresholds_from_frames`."""
+"""Smallest relative error for sharp and for blurred frames; see `thresholds_from_frames`."""
 
 MOST_FRAMES = 200
-"""Most frames, successive ones, among which those are looked for that enclose an interval."""
+"""Largest number of successive frames that are searched for those that enclose an interval."""
 
 NEAREST_ROWS = 400
-"""Intervals of each polarity, those that frames enclose most closely, which a blind sensor's thresholds come from."""
+"""Intervals of each polarity from which the thresholds of a blind sensor come: those that frames enclose most
+closely."""
 
 FEWEST_NEAREST = 50
-"""Fewest of them."""
+"""Smallest number of such intervals."""
 
 LARGEST_ERROR = 0.5
-"""Largest relative error of thresholds that are said to be measured."""
+"""Largest relative error of thresholds that count as measured."""
 
 
 def thresholds_from_frames(
     recording: EventRecording, blind_for: int
 ) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], str] | None:
-    """C_on and C_off by which events explain how log brightness changes from frame to frame.
+    """C_on and C_off with which the events explain the changes of log brightness from frame to frame.
 
-    Frames are taken as they are learnt from: linear, with the response that the recording states. A change is
-    C_on * (on events) - C_off * (off events), where the last event before each frame counts `GONE_ON` more: a pixel
-    after an on event is likely above what it memorised. Least squares would take the noise of the events for a sign
-    that they are worth less (attenuation in a regression: less than two thirds on slider_depth). So what the pixels
-    around one changed by, which knows nothing of its noise, stands in place of its events in the normal equations:
-    instruments, of changes up and of changes down. That changes are told differently by frames that are twice as far
-    apart is part of the error. On simulated recordings with known thresholds the mean is right within 4 % (validation
-    set, `floor`, `relief`, `clutter`, `near`), of a sensor with all faults but blindness (`clutter-faults`) 14 % high.
+    Frames are linear, with the response that the recording states. A change is
+    C_on * (on events) - C_off * (off events). The last event before each frame counts `GONE_ON` more, since a pixel
+    after an on event is probably above its memorised value. With least squares, the noise of the events would lower the
+    thresholds (attenuation in a regression: to less than two thirds on slider_depth). The mean change of the
+    neighbouring pixels is independent of that noise. It therefore takes the place of the events in the normal equations
+    (instrumental variables, one for changes up and one for changes down). The difference between the results of frames
+    at one and at two steps is part of the error. On simulated recordings with known thresholds the mean is right within
+    4 % (validation set, `floor`, `relief`, `clutter`, `near`). For a sensor with all faults but blindness
+    (`clutter-faults`) it is 14 % high.
 
-    Of a sensor with a refractory period, changes are missed. What remains is each interval from the end of blindness to
-    the next event, in which brightness changes by one threshold: intervals that two frames enclose closely, in a
-    straight line to those that they enclose exactly. Half of the scatter is part of the error.
+    A sensor with a refractory period misses changes. From the end of the period to the next event, brightness still
+    changes by one threshold. The intervals that two frames enclose most closely are used, and extrapolated in a
+    straight line to intervals that frames enclose exactly. Half of the scatter is part of the error.
 
     Args:
-        recording: Its index is made if it is not there yet; its sharp frames are taken, else the blurred ones, whose
-            events are counted at several instants of the exposure.
+        recording: The recording; its index is made if it does not exist. Its sharp frames are used, else the blurred
+            ones, whose events are counted at several instants of the exposure.
         blind_for: The refractory period, ns; 0 for none.
 
     Returns:
-        Values, standard errors, and half a sentence that says what they rest on. None without frames, where another
-        camera took them, where frames are too blurred for a blind sensor, or where they do not tell both thresholds.
+        Values, standard errors, and half a sentence on what they rest on. None if there are no frames, another camera
+        took them, they are too blurred for a blind sensor, or they do not determine both thresholds.
 
     Raises:
         RecordingError: The file of a frame is missing or cannot be decoded.
@@ -119,17 +123,17 @@ def thresholds_from_frames(
 
 
 def exposure_change(recording: EventRecording, frames: Frames) -> float | None:
-    """By how much the exposure of frames changes from one to the next, root mean square of log brightness.
+    """Change of the exposure from frame to frame, as root mean square of log brightness.
 
-    It is told by pixels that saw no event between two frames: what they see changed by less than a threshold, up as
-    often as down, so the median of their change is that of the exposure.
+    It comes from the pixels without an event between two frames. Their brightness changed by less than a threshold, up
+    as often as down, so that the median of their change is the change of the exposure.
 
     Args:
-        recording: Its index is made if it is not there yet.
-        frames: Those that may be looked at.
+        recording: The recording; its index is made if it does not exist.
+        frames: Frames of the recording that may be used.
 
     Returns:
-        None where another camera took the frames, or too few pixels are without events.
+        None if another camera took the frames, or too few pixels are without events.
 
     Raises:
         RecordingError: The file of a frame is missing or cannot be decoded.
@@ -140,18 +144,18 @@ def exposure_change(recording: EventRecording, frames: Frames) -> float | None:
 
 
 def mean_brightness(recording: EventRecording, frames: Frames, event_share: float) -> float | None:
-    """Geometric mean of the brightness that frames show of what a field is asked for that learns from events.
+    """Geometric mean of the brightness of frames, over the pixels that a field renders which learns from events.
 
-    What is not brighter than `FAINTEST` does not count.
+    Pixels that are not brighter than `FAINTEST` do not count.
 
     Args:
-        recording: Its index is made if it is not there yet.
-        frames: Those that may be looked at; `NUM_STARTS` of them are, evenly taken.
-        event_share: Share of the rays that belong to events: pixels count in proportion to theirs. Of the others, all
-            pixels count alike.
+        recording: The recording; its index is made if it does not exist.
+        frames: Frames of the recording that may be used; `NUM_STARTS` of them are used, evenly spaced.
+        event_share: Share of the rays that belong to events. For this share, pixels count in proportion to their
+            events; for the rest, all pixels count alike.
 
     Returns:
-        None where another camera took the frames, or they are black.
+        None if another camera took the frames, or they are black.
 
     Raises:
         RecordingError: The file of a frame is missing or cannot be decoded.
@@ -173,19 +177,22 @@ def mean_brightness(recording: EventRecording, frames: Frames, event_share: floa
 
 @dataclass(frozen=True)
 class _Between:
-    """Where an instant lies between the events of some pixels."""
+    """Place of an instant between the events of some pixels."""
 
     is_known: Bool[np.ndarray, " pixels"]
     """Whether there are events before and after."""
     number: Int64[np.ndarray, " pixels"]
-    """Events up to the instant; `rises` of them are on events."""
+    """Events up to the instant."""
     rises: Int64[np.ndarray, " pixels"]
+    """On events up to the instant."""
     since: Int64[np.ndarray, " pixels"]
-    """Time since the last event, ns; `until` is that to the next one."""
+    """Time since the last event, ns."""
     until: Int64[np.ndarray, " pixels"]
+    """Time to the next event, ns."""
     after_on: Bool[np.ndarray, " pixels"]
-    """Whether the last event is an on event; `before_on`, whether the next one is."""
+    """Whether the last event is an on event."""
     before_on: Bool[np.ndarray, " pixels"]
+    """Whether the next event is an on event."""
 
 
 @dataclass(frozen=True)
@@ -193,13 +200,14 @@ class _Seen:
     """A frame beside the events."""
 
     brightness: Float64[np.ndarray, " sensor"]
-    """Log brightness of all pixels of the sensor, as `_Comparison._log_brightness` has it."""
+    """Log brightness of all pixels of the sensor; see `_Comparison._log_brightness`."""
     is_known: Bool[np.ndarray, " pixels"]
     """Whether the pixels that are compared have events before and after."""
     rises: Float64[np.ndarray, " pixels"]
-    """On events of these pixels up to the frame, the mean over its exposure, and what they have gone on since."""
+    """On events of the compared pixels up to the frame, as a mean over its exposure, and what brightness has gone on
+    since."""
     falls: Float64[np.ndarray, " pixels"]
-    """The same of off events."""
+    """The same for off events."""
 
 
 class _Comparison:
@@ -219,22 +227,22 @@ class _Comparison:
 
     @property
     def is_sharp(self) -> bool:
-        """Whether frames are of an instant, as far as is known."""
+        """Whether no frame has a known exposure time."""
         return not np.ptp(self.frames.exposed, axis=1).any()
 
     @cached_property
     def exposure_change(self) -> float | None:
-        """As `exposure_change` says."""
+        """Change of the exposure from frame to frame; see the function `exposure_change`."""
         number = len(self.frames.times)
         if number < 2:
             return None
         firsts = np.unique(np.linspace(0, number - 2, NUM_STARTS).round().astype(int))
         found = [self._exposure_step(*map(self._seen, (first, first + 1))) for first in firsts.tolist()]
-        told = [step for step in found if step is not None]
-        return float(np.sqrt(np.mean(np.square(told)))) if 2 * len(told) > len(found) else None
+        known = [step for step in found if step is not None]
+        return float(np.sqrt(np.mean(np.square(known)))) if 2 * len(known) > len(found) else None
 
     def _exposure_step(self, one: _Seen, other: _Seen) -> float | None:
-        """By how much log exposure changes between two frames; None where too few pixels saw no event."""
+        """Change of log exposure between two frames; None if too few pixels saw no event."""
         table, _, change = self._difference(one, other)
         quiet = change[~table.any(axis=1)]
         return float(np.median(quiet)) if len(quiet) >= FEWEST_QUIET else None
@@ -317,8 +325,8 @@ class _Comparison:
         return _Seen(self._log_brightness(number), known, rises, falls)
 
     def _difference(self, one: _Seen, other: _Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """On events and minus off events between two frames, as rows of a matrix; what the pixels around changed by, up
-        and down, as rows of another; and the changes that they explain."""
+        """On events and minus off events between two frames as rows of a matrix; changes of the neighbouring pixels, up
+        and down, as rows of another; and the changes of log brightness that they explain."""
         change = other.brightness - one.brightness
         around, chosen = self._of_neighbours(change), self.pixels.numpy()
         change, around = change[chosen], around[chosen]
@@ -328,7 +336,7 @@ class _Comparison:
         return table[known], instruments[known], change[known]
 
     def _of_neighbours(self, change: Float64[np.ndarray, " sensor"]) -> Float64[np.ndarray, " sensor"]:
-        """Mean change of the eight pixels around each; not a number where fewer than `FEWEST_NEIGHBOURS` are known."""
+        """Mean change of the eight pixels around each; not a number if fewer than `FEWEST_NEIGHBOURS` are known."""
         known = np.isfinite(change).reshape(-1, self.index.width)
         filled = np.where(known, change.reshape(known.shape), 0.0)
         ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
@@ -336,7 +344,7 @@ class _Comparison:
         return np.where(number >= FEWEST_NEIGHBOURS, total / np.maximum(number, 1), np.nan).ravel()
 
     def _log_brightness(self, number: int) -> Float64[np.ndarray, " sensor"]:
-        """What all pixels of the sensor see in a frame; not a number where it is too dark or too bright."""
+        """Log brightness of a frame at all pixels of the sensor; not a number where it is too dark or too bright."""
         image = self.frames.image(number)
         image = (image if image.dtype == np.uint8 else 255 * image).astype(float)
         image = image.reshape(len(self.index.offsets) - 1, -1)
@@ -375,12 +383,12 @@ def _between(index: EventIndex, pixels: torch.Tensor, time: int) -> _Between:
 
 
 def _enclosed(change: np.ndarray, late: np.ndarray, early: np.ndarray) -> tuple[float, float, int] | None:
-    """Threshold, its error and on how many intervals it rests.
+    """A threshold, its error, and the number of intervals that it rests on.
 
     Args:
-        change: Of log brightness between two frames within an interval, in the direction of its event.
-        late: From the begin of the interval to the first frame, ms.
-        early: From the second frame to the event, ms.
+        change: Change of log brightness between two frames within an interval, in the direction of its event.
+        late: Time from the start of the interval to the first frame, ms.
+        early: Time from the second frame to the event, ms.
     """
     if len(change) < FEWEST_NEAREST:
         return None

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from enerf_ns.bench import published
 from enerf_ns.bench.experiment import Experiment, Row, Sequence
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED, REAL
 from enerf_ns.choices.presets import SPIRAL_1
+from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 if TYPE_CHECKING:
@@ -69,8 +71,7 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
 """Turns off each of these parts. 64 even samples replace the proposal network."""
 
 NOTHING_LEARNED: dict[str, Any] = {
-    SENSOR + f"learn_{part}": False
-    for part in ("threshold_ratio", "mean_threshold", "threshold_map", "leak_rate", "cutoff_frequency")
+    SENSOR + setting.name: False for setting in fields(SensorModelConfig) if setting.name.startswith("learn_")
 }
 
 FIXED_SENSOR: dict[str, Any] = {

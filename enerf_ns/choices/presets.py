@@ -1,8 +1,8 @@
-"""The selections of the E-NeRF paper (Klenk et al., RA-L 2023), one a sequence: `ns-train enerf --preset eds00`.
+"""The selections of the E-NeRF paper (Klenk et al., RA-L 2023), one for each sequence: `ns-train enerf --preset eds00`.
 
-They are those of the events-only configs that the authors publish with their code. What those get wrong is mended, and
-each mending is noted in its preset. Whether the field learns from events, frames or both is no selection but
-`--pipeline.datamanager.supervision`. The configs on frames that E2VID reconstructed have no preset.
+They come from the events-only configs that the authors publish with their code. Errors in these configs are mended, and
+each mending is noted in its preset. A preset does not select events, frames or both;
+`--pipeline.datamanager.supervision` does. The configs for frames that E2VID reconstructed have no preset.
 """
 
 from __future__ import annotations
@@ -19,43 +19,43 @@ from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 
 @dataclass(frozen=True)
 class Preset:
-    """What the paper selects for one sequence. Frames are counted from 0 in the order of their file names."""
+    """The selection of the paper for one sequence. Frames are counted from 0 in the order of their file names."""
 
     train_frames: tuple[int, ...]
-    """Frames to learn from; where only events are used, they choose the time range of the events."""
+    """Frames to learn from. If only events are used, these frames select the time range of the events."""
     held_out_frames: tuple[int, ...]
-    """Frames for evaluation, none of them a train frame."""
+    """Frames for evaluation; none of them is a train frame."""
     scale: float
     """Network units per metre: a point of the recording's world lies at scale * point + offset in the network."""
     bound: float
     """Half side of the box, a cube around the origin, in network units."""
     event_window: Literal["around", "following"]
-    """Which events belong to a train frame: those around it, half way to its neighbours, and a mean frame period beyond
-    the first and the last; or those that follow it, up to the next train frame, and after the last up to the next frame
-    of the recording."""
+    """Events that belong to a train frame. around: the events half way to its neighbours, and a mean frame period
+    beyond the first and the last train frame. following: the events up to the next train frame, and after the last one
+    up to the next frame of the recording."""
     event_pairs: int
-    """Event pairs drawn at each step."""
+    """Event pairs at each step."""
     frame_rays: int
-    """Frame pixels drawn at each step."""
+    """Frame pixels at each step."""
     contrast_thresholds: tuple[float, float] | None
-    """Contrast thresholds C_on and C_off. None: they are unknown, and the loss is the normalised event loss, which does
-    not need them."""
+    """Contrast thresholds C_on and C_off. None: they are unknown, and the loss is the normalised event loss, which
+    does not need them."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Place of the origin of the recording's world in the network, in network units."""
     silent_pairs: int = 0
-    """Silent pairs drawn at each step: half as many as event pairs, or none where the no-event loss is off."""
+    """Silent pairs at each step: half as many as event pairs, or none if the no-event loss is off."""
     silence_ms: float = 20.0
-    """No-event interval: shortest silence of a pixel that counts, ms."""
+    """Shortest silence (ms) of a pixel that counts: the no-event interval."""
     no_event_weight: float = 1.0
-    """The paper's weight of the no-event loss, whose brightness changes are not counted in thresholds."""
+    """The paper's weight of the no-event loss, which does not count changes of brightness in thresholds."""
     mended: tuple[str, ...] = ()
-    """What was wrong in the published selection and is right here, one sentence each."""
+    """Errors of the published selection that are mended here, one sentence each."""
     notes: tuple[str, ...] = ()
-    """Where the paper and its configs, or these among themselves, do not agree, one sentence each."""
+    """Differences between the paper and its configs, or between its configs, one sentence each."""
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """Centre x, y, z and half side in metres of the recording's world."""
+        """Centre x, y, z and half side of the box, in metres of the recording's world."""
         x, y, z = ((0.0 - offset) / self.scale for offset in self.offset)
         return x, y, z, self.bound / self.scale
 
@@ -66,7 +66,7 @@ class Preset:
 
 
 def without(frames: Iterable[int], train_frames: Iterable[int]) -> tuple[int, ...]:
-    """The frames that are no train frames."""
+    """Frames without the train frames, in increasing order."""
     return tuple(sorted(set(frames) - set(train_frames)))
 
 
@@ -285,7 +285,7 @@ def event_time_range(
     Args:
         frames: At least two.
         train_frames: Numbers of the selected frames, increasing; all of them in `frames`.
-        event_window: As of `Preset`.
+        event_window: Events that belong to a train frame; see `Preset.event_window`.
     """
     times = dict(zip(frames.numbers.tolist(), frames.times.tolist(), strict=True))
     period = float(frames.times[-1] - frames.times[0]) / float(frames.numbers[-1] - frames.numbers[0])
@@ -298,10 +298,10 @@ def event_time_range(
 
 
 def preset_named(name: str) -> str:
-    """The name of a preset as it is written here; spellings of the reference's configs, such as mocapDesk2, are known.
+    """The key of a preset in `PRESETS`. Spellings of the reference's configs, such as mocapDesk2, are accepted.
 
     Raises:
-        FlagError: There is none of this name.
+        FlagError: No preset has this name.
     """
     known = {preset.replace("-", "").lower(): preset for preset in PRESETS}
     found = known.get(name.replace("-", "").replace("_", "").lower())
@@ -313,21 +313,21 @@ def preset_named(name: str) -> str:
 def selections(
     name: str, recording: EventRecording, parser: EventDataParserConfig, whole: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """What a preset says of the settings of a pipeline, and what to show of it.
+    """Settings of a pipeline from a preset, and notes for the user.
 
     Args:
-        name: Of the preset.
+        name: Name of the preset.
         recording: The sequence of the preset, with all its frames.
-        parser: What the user set; of frames that they chose for one use, none is selected for the other, and where
-            they hold out every so many, none is selected at all.
-        whole: Whether its box and batch sizes are used, too. Most of the paper's boxes are empty, and its batches are
-            for a GPU.
+        parser: The data parser as the user set it. Frames that the user chose for training are not held out, and the
+            reverse. If the user sets held_out_every, the preset selects no frames.
+        whole: Whether its box and batch sizes are used as well. Most of the paper's boxes are empty, and its batches
+            are for a GPU.
 
     Returns:
-        The settings by their names within the config of the pipeline, and sentences: the selection, what was mended.
+        The settings by their names within the config of the pipeline, and sentences on the selection and its mendings.
 
     Raises:
-        RecordingError: The recording has not the frames that the preset selects.
+        RecordingError: The recording does not have the frames that the preset selects.
     """
     preset = PRESETS[name]
     train = without(preset.train_frames, parser.held_out_frame_indices or ())

@@ -1,4 +1,4 @@
-"""What numbers a run may be set to, checked before anything is read or written."""
+"""Ranges of the numbers in a config, checked before anything is read or written."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from enerf_ns.dataparsers.recording.camera import LARGEST_SIDE
 from enerf_ns.dataparsers.recording.errors import FlagError
-from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, DEPTH_LIMITS, LONGEST_REFRACTORY_PERIOD
+from enerf_ns.dataparsers.recording.recording import DEPTH_LIMITS
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
 MOST_STEPS = 10**9
 MOST_DRAWS = 2**24
-"""Most pairs, rays or samples that are drawn at once: beyond it, they fill any memory."""
+"""Largest number of pairs, rays or samples that are drawn at once; more would fill any memory."""
 
 COUNT, WEIGHT, LEARNING_RATE = (0, 10**9), (0.0, 1e6), (1e-12, 1.0)
 
@@ -94,14 +94,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "num_features": (1, 4096),
     "num_proposal_samples": (1, 2**16),
     "num_samples": (1, 2**16),
-    "contrast_thresholds": CONTRAST_THRESHOLD_LIMITS,
-    "refractory_period_ns": (0, LONGEST_REFRACTORY_PERIOD),
-    "leak_rate": (0.0, 1e6),
-    "cutoff_frequency": (1e-3, 1e9),
-    "least_delay": (0.0, 1e9),
-    "second_cutoff_frequency": (1e-3, 1e9),
-    "width": (1, 2**15),
-    "height": (1, 2**15),
     "event_loss_weight": WEIGHT,
     "no_event_loss_weight": WEIGHT,
     "no_event_margin": (0.0, 1.0),
@@ -113,14 +105,15 @@ RANGES: dict[str, tuple[float, float]] = {
     "interlevel_loss_weight": WEIGHT,
     "near_plane": (0.0, 1e3),
     "init_density": (1e-6, 1e6),
-    "clock_ms": (-100.0, 100.0),  # of which more is another recording's
+    "clock_ms": (-100.0, 100.0),  # a larger delay means poses of another recording
     "frame_delay_ms": (-100.0, 100.0),
     "focal_scale": (0.8, 1.2),
 }
-"""Lowest and highest value of each number, or of each of some numbers, by the name of its field in the config."""
+"""Lowest and highest value of each number, or of each of several numbers, by the name of its field in the config. The
+parts of the sensor have the ranges of their own settings."""
 
 WITHOUT_KEYS = ("collider_params", "gradient_accumulation_steps")
-"""Dictionaries that are one flag each; of the others, each key is."""
+"""Dictionaries that are one flag each; of the others, each key is a flag."""
 
 WITHOUT_FLAG = (
     *("pipeline.defaults", "pipeline.resolution", "pipeline.datamanager.pixel_sampler", "pipeline.model.sensor.width"),
@@ -132,24 +125,26 @@ WITHOUT_FLAG = (
 
 
 def check_ranges(config: TrainerConfig) -> None:
-    """Refuses a config that holds a number that is not finite, or one outside its range in `RANGES`.
+    """Refuses a config that holds a number that is not finite, or one outside its range.
 
     Raises:
-        FlagError: Names the first such number as ns-train's flag.
+        FlagError: Names the first such number by its flag of ns-train.
     """
+    pipeline: Any = config.pipeline
+    ranges = RANGES | pipeline.model.sensor._target.ranges()
     for path, setting, values in _numbers((), "", config):
-        lowest, highest = RANGES.get(setting, (-math.inf, math.inf))
+        lowest, highest = ranges.get(setting, (-math.inf, math.inf))
         if not all(math.isfinite(value) and lowest <= value <= highest for value in values):
-            expected = f"from {lowest:.10g} to {highest:.10g}" if setting in RANGES else "finite"
+            expected = f"from {lowest:.10g} to {highest:.10g}" if setting in ranges else "finite"
             raise FlagError(f"{_flag(path)} is {_shown(values)}, but must be {expected}.")
     _check_order(config)
 
 
 def _check_order(config: TrainerConfig) -> None:
-    """Refuses numbers that do not fit one another.
+    """Refuses numbers that contradict each other.
 
     Raises:
-        FlagError: Names their flags.
+        FlagError: Names the flags of such numbers.
     """
     pipeline: Any = config.pipeline
     parser, model = pipeline.datamanager.dataparser, pipeline.model
@@ -178,7 +173,13 @@ def _check_order(config: TrainerConfig) -> None:
 
 
 def _numbers(path: tuple[str, ...], setting: str, value: Any) -> Iterator[tuple[tuple[str, ...], str, list[Any]]]:
-    """Place, name of the field, and values of every number within a part of a config, which has this place and name."""
+    """Place, name of the field, and values of every number within a part of a config.
+
+    Args:
+        path: Place of the part within the config.
+        setting: Name of the field that holds the part.
+        value: The part.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from _numbers((*path, field.name), field.name, getattr(value, field.name))
@@ -192,7 +193,7 @@ def _numbers(path: tuple[str, ...], setting: str, value: Any) -> Iterator[tuple[
 
 
 def _flag(path: tuple[str, ...]) -> str:
-    """A setting as ns-train spells it; as the config does, where there is no flag for it."""
+    """The flag of ns-train for a setting, or its place within the config if it has no flag."""
     if ".".join(path).startswith(WITHOUT_FLAG):
         return ".".join(path)
     if path[:3] == ("pipeline", "datamanager", "dataparser"):

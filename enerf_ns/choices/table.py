@@ -1,4 +1,4 @@
-"""What training prints: what the recording holds, what is made of it, and what was found to be wrong with its poses."""
+"""Tables that training prints: the recording, the choices, and the errors of clock, poses and lens."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from enerf_ns.choices.resolver import Choice
+from enerf_ns.choices.resolution import Choice
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.problems import find_problems
@@ -16,11 +16,11 @@ from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 from enerf_ns.poses.findings import Finding
 
 PREFIX = "--pipeline."
-"""What flags begin with, said once below a table."""
+"""Begin of the flags, which stands once below a table."""
 
 
 def recording_table(parser: EventDataParserConfig) -> Table:
-    """What a recording holds, and where its scene is taken to lie."""
+    """The table of the contents of a recording, its depths, its box and its problems."""
     recording = parser.setup().recording()
     index, camera = index_events(recording), recording.camera
     first, last = index.span
@@ -59,7 +59,7 @@ def recording_table(parser: EventDataParserConfig) -> Table:
 
 
 def choices_table(choices: Sequence[Choice]) -> Table:
-    """What is kept and what is left out, why, and by which flag it is forced."""
+    """The table of choices: the parts of the method, whether each is kept, why, and the flag that forces it."""
     caption = f"forced by {PREFIX}FLAG VALUE, those of event-data at the end"
     table = _table("Parts of the method", caption, ("part", "", "what", "why", "flag"))
     for choice in choices:
@@ -70,7 +70,7 @@ def choices_table(choices: Sequence[Choice]) -> Table:
 
 
 def findings_table(found: Sequence[Finding]) -> Table:
-    """What was found to be wrong with clock, poses and lens, and by how much that moves the picture."""
+    """The table of the errors of clock, poses and lens, and the distance (pixels) by which each moves the picture."""
     caption = f"forced or forbidden by {PREFIX}FLAG True or False"
     table = _table("Clock, poses and lens", caption, ("part", "", "found", "moves the picture by", "flag"))
     for row in found:
@@ -82,7 +82,7 @@ def findings_table(found: Sequence[Finding]) -> Table:
 
 
 def _table(title: str, caption: str, columns: Sequence[str]) -> Table:
-    """An empty table whose cells may go over several lines."""
+    """An empty table whose cells may have several lines."""
     table = Table(title=title, caption=caption)
     table.title_justify = table.caption_justify = "left"
     for column in columns:

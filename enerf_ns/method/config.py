@@ -13,11 +13,12 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from enerf_ns.choices.resolver import MethodDefaults
+from enerf_ns.choices.resolution import MethodDefaults
 from enerf_ns.method.datamanager import EnerfDataManagerConfig
 from enerf_ns.method.model import EnerfModelConfig
 from enerf_ns.method.pipeline import EnerfPipelineConfig
 from enerf_ns.method.trainer import EnerfTrainerConfig
+from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 
@@ -37,18 +38,6 @@ class DecayOverRunSchedulerConfig(ExponentialDecaySchedulerConfig):
 
     max_steps: Optional[int] = None  # type: ignore  # noqa: UP045
     """Step at which lr_final is reached. Default: the last step of the run."""
-
-
-SENSOR_LEARNING_RATES = {
-    "threshold_ratio": 1e-2,
-    "mean_threshold": 3e-3,
-    "refractory_period": 3e-3,
-    "response": 1e-2,
-    "bandwidth": 3e-2,
-    "leak_rate": 3e-2,
-    "sensor": 1e-3,
-}
-"""Learning rate of each group of sensor parameters, by its name. The parameters are scaled to be near 1."""
 
 
 def method_config(
@@ -76,7 +65,7 @@ def method_config(
                     "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
                     "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * rate),
                 }
-                for name, rate in SENSOR_LEARNING_RATES.items()
+                for name, rate in SensorModel.learning_rates().items()
             },
         },
         viewer=ViewerConfig(quit_on_train_completion=True),

@@ -21,7 +21,7 @@ from torch import Tensor
 from tyro.conf import Fixed, OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
-from enerf_ns.choices.resolver import HELD_OUT_SPANS
+from enerf_ns.choices.events import HELD_OUT_SPANS
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_data
 from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.index.event_index import EventIndex

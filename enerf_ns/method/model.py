@@ -21,7 +21,8 @@ from torch import Tensor
 from torch.nn import Parameter
 from tyro.conf import Fixed
 
-from enerf_ns.choices.resolver import FRAME_LOSS_WEIGHT, MEAN_BRIGHTNESS
+from enerf_ns.choices.brightness import MEAN_BRIGHTNESS
+from enerf_ns.choices.frames import FRAME_LOSS_WEIGHT
 from enerf_ns.dataparsers.sensor_estimates.frame_contrast import FAINTEST
 from enerf_ns.evaluation.metrics import psnr, ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align

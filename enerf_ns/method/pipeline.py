@@ -18,7 +18,8 @@ from torch.distributed import barrier
 from torch.nn.parallel import DistributedDataParallel
 from tyro.conf import Fixed, Suppress
 
-from enerf_ns.choices.resolver import MethodDefaults, Resolution, resolve
+from enerf_ns.choices.resolution import MethodDefaults, Resolution
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available

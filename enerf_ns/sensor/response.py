@@ -1,9 +1,8 @@
-"""How a pixel answers brightness: what it sees of colours, and the logarithm that it compares.
+"""The response of a pixel to brightness, and the colour filter before it.
 
-Brightness is linear radiance, usually in [0, 1]. The field and the simulator use the same functions. Responses work on
-tensors and NumPy arrays of any shape and type of float, and what they return is of the same kind: PyTorch's are
-differentiable, and NumPy's logarithm of a number is the same whatever the number of threads. The other functions take
-tensors.
+Brightness is linear radiance, usually in [0, 1]. The field and the simulator use the same functions. Responses take
+tensors or NumPy arrays of any shape and type of float, and return the same kind: tensors are differentiable, and the
+logarithm of NumPy is the same for any number of threads. The other functions take tensors.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor, nn
+from torch import Tensor
 
 from enerf_ns.kernels.precision import full_precision
 
@@ -29,11 +28,12 @@ SMALLEST_OFFSET, LARGEST_OFFSET = 1e-9, 1.0
 """Smallest and largest offset of `Logarithm` and of `Gamma`."""
 
 LARGEST_EXPONENT = 3.0
-"""Largest exponent of `Gamma`, whose smallest is 1: to its power, whatever a field renders is finite in float32."""
+"""Largest exponent of `Gamma`; the smallest is 1. To this power, all brightness that a field renders is finite in
+float32."""
 
 
 class Response(Protocol):
-    """What a pixel makes of brightness; increasing."""
+    """An increasing function from brightness to the log brightness that a pixel compares."""
 
     @property
     def name(self) -> str:
@@ -41,7 +41,7 @@ class Response(Protocol):
         ...
 
     def __call__(self, brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Log brightness, in the units in which contrast thresholds are."""
+        """Log brightness, in the units of contrast thresholds."""
         ...
 
     def inverse(self, log_brightness: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -69,7 +69,7 @@ class Linlog:
 
 @dataclass(frozen=True)
 class Logarithm:
-    """ln(brightness + offset), as simulators have it (ESIM: Rebecq, Gehrig, Scaramuzza, CoRL 2018)."""
+    """ln(brightness + offset), the response of simulators (ESIM: Rebecq, Gehrig, Scaramuzza, CoRL 2018)."""
 
     offset: float = 0.001
 
@@ -89,10 +89,10 @@ class Logarithm:
 
 @dataclass(frozen=True)
 class Gamma:
-    """ln(brightness^exponent + offset) of brightness that is gamma-encoded, as in pictures (EventNeRF: Rudnev et al.,
-    CVPR 2023).
+    """ln(brightness^exponent + offset) of gamma-encoded brightness, as in pictures (EventNeRF: Rudnev et al., CVPR
+    2023).
 
-    A field that is trained with it renders such brightness, and not linear one: `Logarithm` of its power.
+    A field that is trained with it renders gamma-encoded brightness. The response is the `Logarithm` of its power.
     """
 
     exponent: float = 2.2
@@ -119,7 +119,7 @@ def response_named(name: str) -> Response:
     `gamma:EXPONENT:OFFSET` such as `gamma:2.2:0.1`.
 
     Raises:
-        ValueError: It is none of them; a sentence that can follow the name of a file or flag.
+        ValueError: The name is none of these. The message can follow the name of a file or flag.
     """
     kind, *arguments = name.split(":")
     try:
@@ -170,7 +170,7 @@ def _library(values: Tensor | np.ndarray) -> Any:
 
 
 LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in what a grey sensor sees (ITU-R BT.601)."""
+"""Weights of red, green and blue in the brightness that a grey sensor sees (ITU-R BT.601)."""
 
 
 @full_precision
@@ -187,7 +187,7 @@ class ColourFilter:
     Args:
         pattern: Letters R, G and B of the pixels (0, 0), (1, 0), (0, 1) and (1, 1) as x, y, such as RGGB; the filter
             repeats them.
-        width: Of the sensor, pixels.
+        width: Width of the sensor, pixels.
 
     Raises:
         ValueError: The pattern is not four of these letters.
@@ -202,7 +202,7 @@ class ColourFilter:
         self._tile = torch.tensor(["RGB".index(letter) for letter in pattern])
 
     def channels(self, pixels: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
-        """Colour channel, 0, 1 or 2, that each of some pixels (y * width + x) sees."""
+        """Colour channel, 0, 1 or 2, that each pixel (y * width + x) sees."""
         x, y = pixels % self.width, pixels // self.width
         return self._tile.to(pixels.device)[2 * (y % 2) + x % 2]
 
@@ -210,45 +210,5 @@ class ColourFilter:
 def pixel_brightness(
     rgb: Float[Tensor, "*batch 3"], channel: Int64[Tensor, "*batch"] | None
 ) -> Float[Tensor, "*batch"]:
-    """Brightness that pixels see of three colour channels: each its own channel, or luma where that is None."""
+    """Brightness that pixels see of three colour channels: their own channel, or luma if `channel` is None."""
     return luma(rgb) if channel is None else rgb.gather(-1, channel[..., None])[..., 0]
-
-
-KNOTS = 17
-"""Knots of a learned response, evenly over the log brightness that it starts as."""
-
-KNOTS_FROM_TO = (1e-3, 1.0)
-"""Brightness at the first and at the last knot."""
-
-
-class LearnedResponse(nn.Module):
-    """A monotone response that starts as a known one: of that one's log brightness a piecewise linear function, whose
-    slopes are positive and on average 1, since their mean is the sensor's contrast threshold.
-
-    Args:
-        start: The response before training.
-    """
-
-    def __init__(self, start: Response):
-        super().__init__()
-        self.start = start
-        self.name = f"learned:{start.name}"
-        first, last = (float(start(torch.tensor(b, dtype=torch.float64))) for b in KNOTS_FROM_TO)
-        self._first, self._step = first, (last - first) / (KNOTS - 1)
-        self.log_slopes = nn.Parameter(torch.zeros(KNOTS - 1))
-
-    def forward(self, brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Log brightness; beyond the knots the first and the last slope go on."""
-        place = (self.start(brightness) - self._first) / self._step
-        slopes = torch.softmax(self.log_slopes, dim=0) * (KNOTS - 1)
-        values = torch.cat([slopes.new_zeros(1), slopes.cumsum(dim=0)])
-        knot = place.detach().floor().long().clamp(0, KNOTS - 2)
-        return self._first + self._step * (values[knot] + slopes[knot] * (place - knot))
-
-    def inverse(self, log_brightness: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Linear brightness whose log brightness is the argument."""
-        place = (log_brightness - self._first) / self._step
-        slopes = torch.softmax(self.log_slopes, dim=0) * (KNOTS - 1)
-        values = torch.cat([slopes.new_zeros(1), slopes.cumsum(dim=0)])
-        knot = (torch.searchsorted(values, place.detach().contiguous(), right=True) - 1).clamp(0, KNOTS - 2)
-        return self.start.inverse(self._first + self._step * (knot + (place - values[knot]) / slopes[knot]))

@@ -14,7 +14,9 @@ import yaml
 from small_runs import EVENTS, HEIGHT, WIDTH, check_two_steps, small_config
 
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, recording_of_points, shaking
-from enerf_ns.choices.resolver import Choice, Resolution, is_colour, resolve
+from enerf_ns.choices.brightness import is_colour
+from enerf_ns.choices.resolution import Choice, Resolution
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
@@ -233,7 +235,7 @@ def test_the_response_is_learned_where_frames_tell_it_and_nobody_states_it(recor
 
     assert chosen("events", None, unknown)[1].startswith("logarithm:0.01; pixels see the logarithm of brightness")
     learned, said = chosen("events+frames", None, unknown)
-    assert learned and "learned, starting from linlog" in said and "frames tell it better" in said
+    assert learned and "learned, starting from linlog" in said and "frames determine it better" in said
     for supervision, response, made in (
         ("events", None, unknown),
         ("events+frames", "logarithm:0.1", unknown),
@@ -350,7 +352,7 @@ def test_a_delay_of_less_than_a_twentieth_of_the_time_between_events_is_none(rec
         (
             {"cutoff_frequency": 100.0, "learn_cutoff_frequency": True},
             "bandwidth",
-            "how far pixels lag behind brightness is learned",
+            "the lag of pixels behind brightness is learned",
         ),
         ({"second_cutoff_frequency": 200.0}, "second stage", "pixels lag by 0.796 ms more"),
     ],

@@ -24,7 +24,8 @@ from enerf_ns.events.samplers import (
     SilentIntervalSampler,
     SilentPixelSampler,
 )
-from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.sensor.part import GREY
+from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
 
 WIDTH, HEIGHT = 5, 4
 MODES = ["successor", "partner", "window"]

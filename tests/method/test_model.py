@@ -13,7 +13,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import interlevel_loss, ray_samples_to_sdist
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
-from enerf_ns.choices.resolver import MEAN_BRIGHTNESS
+from enerf_ns.choices.brightness import MEAN_BRIGHTNESS
 from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.rendering.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma

@@ -19,9 +19,12 @@ from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.dataparsers.sensor_estimates.estimates import threshold_differences
 from enerf_ns.events.batch import EventBatch
 from enerf_ns.events.samplers import EventPairSampler, SilentPixelSampler
-from enerf_ns.method.config import SENSOR_LEARNING_RATES
-from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.sensor.lag import delay_error
+from enerf_ns.sensor.leak import leak_rate_error
+from enerf_ns.sensor.part import GREY
+from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
 from enerf_ns.sensor.threshold_map import SOLVED_EVERY, ThresholdMap
+from enerf_ns.sensor.thresholds import ratio_error
 from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
 
@@ -102,7 +105,8 @@ def learn(
 ) -> SensorModel:
     """Trains the sensor alone, with the learning rates of the method, which fall to a tenth; told makes of a batch what
     it is told of it."""
-    groups = [{"params": group, "lr": SENSOR_LEARNING_RATES[name]} for name, group in sensor.get_param_groups().items()]
+    rates = sensor.learning_rates()
+    groups = [{"params": group, "lr": rates[name]} for name, group in sensor.get_param_groups().items()]
     adam = torch.optim.Adam(groups) if groups else None
     drawn = Drawn(index, 0, mode)
     supervision = EventSupervision("huber", 1.0, 0.1, 0.0)
@@ -112,7 +116,7 @@ def learn(
         sensor.observe(brightness_change(start, end, batch, sensor).detach(), batch)
         if adam is not None:
             for group, (name, _) in zip(adam.param_groups, sensor.get_param_groups().items(), strict=True):
-                group["lr"] = SENSOR_LEARNING_RATES[name] * 0.1 ** (step / steps)
+                group["lr"] = rates[name] * 0.1 ** (step / steps)
             adam.zero_grad()
             torch.stack([*supervision.losses(start, end, batch, sensor).values()]).sum().backward()
             adam.step()
@@ -427,3 +431,25 @@ def test_what_is_learned_is_stored(name: str):
     other.load_state_dict(sensor.state_dict())
     for a, b in zip(sensor.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(a, b)
+
+
+def test_the_errors_of_learning_are_those_of_estimates_from_many_recordings():
+    """Events are at random times; estimated are their rate, the balance of their polarities, and the time of a step."""
+    generator = np.random.default_rng(5)
+    pixels, seconds, rate = 40, 2.0, 30.0
+    rates, ratios, found = [], [], []
+    for _ in range(200):
+        counts = generator.poisson(rate * seconds, pixels)
+        times = np.sort(generator.uniform(0.0, seconds * 1e9, counts.sum())).astype(np.int64)
+        pixel = generator.permutation(np.repeat(np.arange(pixels), counts))
+        is_on = generator.random(len(times)) < 0.5
+        events = Events(pixel, np.zeros_like(pixel), times, np.where(is_on, 1, -1))
+        index = EventIndex.from_events(events, pixels, 1)
+        found.append({measure: measure(index) for measure in (ratio_error, leak_rate_error, delay_error)})
+        rates.append(len(times) / (pixels * seconds))
+        ratios.append(np.log(is_on.sum() / (~is_on).sum()))
+    mean = {name: np.mean([errors[name] for errors in found]) for name in found[0]}
+    assert mean[leak_rate_error] == pytest.approx(np.std(rates), rel=0.15)
+    assert mean[ratio_error] == pytest.approx(np.std(ratios), rel=0.15)
+    median = 1e3 * np.log(2.0) / rate  # ms, of an exponential distribution
+    assert mean[delay_error] == pytest.approx(median / np.sqrt(rate * seconds * pixels), rel=0.1)

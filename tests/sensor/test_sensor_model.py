@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from enerf_ns.events.batch import EventBatch
+from enerf_ns.sensor.part import GREY
 from enerf_ns.sensor.response import linlog, luma
-from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
 
 
 def sensor(**changes: Any) -> SensorModel:

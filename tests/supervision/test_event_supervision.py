@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from enerf_ns.events.batch import EventBatch
-from enerf_ns.sensor.sensor_model import GREY, SensorModel, SensorModelConfig
+from enerf_ns.sensor.part import GREY
+from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES, EventSupervision, brightness_change
 
 ON, OFF, WIDTH = 0.2, 0.4, 4

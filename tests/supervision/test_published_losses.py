@@ -14,7 +14,8 @@ import torch
 from nerfstudio.configs.method_configs import all_descriptions, all_methods
 from small_runs import EVENTS, check_two_steps, set_up, small_config
 
-from enerf_ns.choices.resolver import Resolution, resolve
+from enerf_ns.choices.resolution import Resolution
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.method.config import enerf
 from enerf_ns.method.runs import method_config

@@ -22,7 +22,6 @@ from enerf_ns.dataparsers.sensor_estimates.estimates import (
     ASSUMED_THRESHOLD,
     FEWEST_SLOPE,
     contrast_thresholds,
-    errors_of_learning,
     noise_per_event,
     refractory_period,
     share_closer,
@@ -109,27 +108,6 @@ def test_a_short_recording_tells_nothing():
     assert refractory_period(equal) is None
 
 
-def test_the_errors_of_learning_are_those_of_estimates_from_many_recordings():
-    """Of events at random times: their rate, the balance of their polarities, and when a step at all pixels was."""
-    generator = np.random.default_rng(5)
-    pixels, seconds, rate = 40, 2.0, 30.0
-    rates, ratios, told = [], [], []
-    for _ in range(200):
-        counts = generator.poisson(rate * seconds, pixels)
-        times = np.sort(generator.uniform(0.0, seconds * 1e9, counts.sum())).astype(np.int64)
-        pixel = generator.permutation(np.repeat(np.arange(pixels), counts))
-        is_on = generator.random(len(times)) < 0.5
-        events = Events(pixel, np.zeros_like(pixel), times, np.where(is_on, 1, -1))
-        told.append(errors_of_learning(EventIndex.from_events(events, pixels, 1)))
-        rates.append(len(times) / (pixels * seconds))
-        ratios.append(np.log(is_on.sum() / (~is_on).sum()))
-    mean = {name: np.mean([errors[name] for errors in told]) for name in told[0]}
-    assert mean["leak_rate"] == pytest.approx(np.std(rates), rel=0.15)
-    assert mean["threshold_ratio"] == pytest.approx(np.std(ratios), rel=0.15)
-    median = 1e3 * np.log(2.0) / rate  # ms, of an exponential distribution
-    assert mean["cutoff_frequency"] == pytest.approx(median / np.sqrt(rate * seconds * pixels), rel=0.1)
-
-
 @pytest.mark.parametrize(("duration", "is_long"), [(0.03, False), (3.0, True)])
 def test_a_recording_too_short_to_tell_a_parameter_keeps_what_it_starts_from(
     tmp_path: Path, duration: float, is_long: bool
@@ -142,7 +120,7 @@ def test_a_recording_too_short_to_tell_a_parameter_keeps_what_it_starts_from(
     found = resolve(config, recording)
     rows = {row.part: row for row in found.choices}
     assert rows["leak"].kept == found.values["model.sensor.learn_leak_rate"] == is_long
-    assert f"{len(index_events(recording)):,} events tell it within" in rows["leak"].why
+    assert f"{len(index_events(recording)):,} events determine it within" in rows["leak"].why
     assert found.values["model.sensor.learn_threshold_ratio"] == is_long
     for part in ("leak", "threshold per polarity"):
         assert ("too few" in rows[part].why) != is_long

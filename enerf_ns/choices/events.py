@@ -1,0 +1,168 @@
+"""Rows of the events: the pairs that are drawn at each step."""
+
+from __future__ import annotations
+
+from enerf_ns.choices.scene import Scene
+from enerf_ns.dataparsers.recording.errors import FlagError
+from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, scene_variance
+from enerf_ns.events.statistics import silent_share
+from enerf_ns.sensor.refractory_period import chosen_refractory_period
+from enerf_ns.sensor.thresholds import balanced_thresholds
+from enerf_ns.supervision.event_supervision import EVENT_LOSSES
+
+HELD_OUT_SPANS = 8
+"""Number of spans of time whose events are kept from training."""
+
+DEFAULT_SILENCE_MS = 20.0
+DEFAULT_WINDOW_MS = 60.0
+
+LONGEST_ACCUMULATION = 0.05
+"""Longest window of accumulated events, as a share of the recording's time: EventNeRF's 50 of 1000 views."""
+
+LONGEST_DISTANCE = 10
+"""Most events that are chosen for a partner to lie ahead; at least 2."""
+
+MOST_NOISE = 0.1
+"""Largest variance (squared thresholds) that noise may add to the events of a pair at the largest distance."""
+
+MOST_NOISE_BETWEEN, NOISE_OF_SCENE = 1.0, 0.125
+"""Largest variance (squared thresholds) that noise may add to the events between any two instants, whose brightness is
+known little better; and the same as a share of the variance of the brightness that a pixel sees, if that is more."""
+
+SMALLEST_SILENT_SHARE = 0.01
+"""Smallest share of the time for which pixels must be silent for silent pixels to be searched. If pixels are silent for
+less, the search finds hardly any."""
+
+
+def held_out_events(scene: Scene) -> None:
+    """Are events kept from training?"""
+    share = scene.config.datamanager.held_out_events
+    value = f"{100 * share:.3g} % of the time, in {HELD_OUT_SPANS} spans" if share else ""
+    why = "the field is scored on them" if share else "the correlation of events is measured over training pairs"
+    scene.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
+
+
+def event_pairs(scene: Scene) -> None:
+    """Which pairs of events are drawn?"""
+    defaults, blind = scene.defaults, scene.once(blind_for)
+    mode = scene.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
+    both = defaults.event_pairs + defaults.silent_pairs
+    given = scene.config.datamanager.event_pairs
+    alone = mode == "partner" and defaults.instants and scene.use_events and not scene.use_frames and not blind
+    alone = alone and scene.config.datamanager.silent_pairs is None
+    instants = scene.use("datamanager.instant_pairs", lambda: (given or both // 2) if alone else 0)
+    usual = both - both // 2 if instants else defaults.event_pairs
+    usual = defaults.noisy_pairs_beside_frames if scene.once(frames_determine_more) else usual
+    pairs = scene.use("datamanager.event_pairs", lambda: usual)
+    distance = scene.use("datamanager.max_pair_distance", lambda: scene.once(_distance_by_noise) or LONGEST_DISTANCE)
+    longest = LONGEST_ACCUMULATION * 1e-6 * (scene.recording.span[1] - scene.recording.span[0])
+    window = scene.use("datamanager.window_ms", lambda: longest if mode == "accumulated" else DEFAULT_WINDOW_MS)
+    if not scene.use_events:
+        supervision = scene.config.datamanager.supervision
+        scene.row("event loss", False, "", f"supervision is {supervision}", "datamanager.supervision")
+        return
+    values = {
+        "successor": "each event with the pixel's next",
+        "partner": f"each event with one of the pixel's next {distance}",
+        "window": f"each event with the pixel's last in {window:g} ms",
+        "accumulated": f"the sum of a pixel's events over up to {window:g} ms",
+    }
+    why = "the field learns from events"
+    if scene.once(_distance_by_noise) is not None:
+        why += f"; their noise adds {scene.once(event_noise):.2g} squared thresholds an event"
+    if blind and mode != "successor":
+        why += "; pixels are blind after an event, for which only datamanager.pair-mode successor is exact"
+    scene.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why, "datamanager.supervision")
+
+
+def any_instants(scene: Scene) -> None:
+    """Are pairs of any two instants drawn, and how far may their instants be apart?"""
+    if not scene.use_events:
+        return
+    name, value, pairs = "datamanager.instant_pairs", "", scene.value("datamanager.instant_pairs")
+    apart = scene.use("datamanager.instants_apart_ms", lambda: _longest_worth_summing(scene) if pairs else 0.0)
+    if pairs:
+        value = f"{pairs} pairs a step, up to {apart:.3g} ms apart, whatever fired between them"
+    why = "they constrain what a pixel sees between edges"
+    if scene.once(blind_for):
+        why = "pixels that are blind after an event miss changes between their events"
+    elif scene.use_frames:
+        why = "frames constrain what lies between edges"
+    elif not scene.defaults.instants:
+        why = "the method does not use them"
+    elif not pairs:
+        why = "other pairs are set by flag"
+    scene.row("any instants", bool(pairs), value, scene.why(name, why), name)
+
+
+def silent_pixels(scene: Scene) -> None:
+    """Does the field learn from pixels that stay silent, and by which loss?
+
+    Raises:
+        FlagError: The event loss does not exist.
+    """
+    defaults, name = scene.defaults, "datamanager.silent_pairs"
+    loss = scene.use("model.event_loss", lambda: defaults.event_loss)
+    if loss not in EVENT_LOSSES:
+        raise FlagError(f"--pipeline.model.event-loss is {loss!r}, but one of {', '.join(EVENT_LOSSES)} was expected.")
+    scene.use("model.no_event_loss_weight", lambda: defaults.no_event_loss_weight)
+    scene.use("model.no_event_margin", lambda: defaults.no_event_margin)
+    silence = scene.use("datamanager.silence_ms", lambda: DEFAULT_SILENCE_MS)
+    if not scene.use_events:
+        scene.use(name, lambda: 0)
+        scene.row("silent pixels", False, "", "the field does not learn from events", "datamanager.supervision")
+        return
+    share = silent_share(scene.index, round(silence * 1e6))
+    between = scene.config.datamanager.silent_mode == "intervals"
+    instants = scene.value("datamanager.instant_pairs")
+    usual = defaults.silent_pairs_beside_frames if scene.use_frames else defaults.silent_pairs
+    if instants or not (between or share > SMALLEST_SILENT_SHARE):
+        usual = 0
+    if scene.once(frames_determine_more):
+        usual = usual * defaults.noisy_pairs_beside_frames // defaults.event_pairs
+    pairs = scene.use(name, lambda: usual)
+    value = f"{pairs} pairs a step" if pairs else "they are not searched"
+    why = f"pixels are silent for {silence:g} ms and longer during {100 * share:.1f} % of the time"
+    if between:
+        value += ", between successive events" if pairs else ""
+        why = "all pixels are silent between their events"
+    if not defaults.silent_pairs:
+        why = "the method does not use them"
+    elif instants:
+        why = "pairs of any instants include silent ones"
+    scene.row("silent pixels", bool(pairs), value, scene.why(name, why), name)
+
+
+def blind_for(scene: Scene) -> int:
+    """Refractory period of the sensor, ns; 0 if pixels are never blind."""
+    return scene.once(chosen_refractory_period)[0]
+
+
+def event_noise(scene: Scene) -> float:
+    """Variance (squared mean thresholds) that noise adds to the sum of a pixel's events with each event."""
+    return noise_per_event(scene.index, balanced_thresholds(scene.index)).value
+
+
+def _distance_by_noise(scene: Scene) -> int | None:
+    """Events that a partner may lie ahead, by their noise; None if pairs are drawn otherwise."""
+    if scene.value("datamanager.pair_mode") != "partner" or not scene.learns_sensor:
+        return None
+    return max(2, min(LONGEST_DISTANCE, round(MOST_NOISE / max(scene.once(event_noise), 1e-9))))
+
+
+def frames_determine_more(scene: Scene) -> bool:
+    """Whether the field learns from frames beside events that are noisy."""
+    distance = scene.once(_distance_by_noise)
+    return scene.use_frames and distance is not None and distance < LONGEST_DISTANCE
+
+
+def _longest_worth_summing(scene: Scene) -> float:
+    """Time (ms) over which the noise of a pixel's events stays below the largest that is worth it; at most the whole
+    recording."""
+    index, noise = scene.index, scene.once(event_noise)
+    first, last = index.span
+    a_pixel = len(index) / max(int((index.offsets.diff() > 0).sum()), 1)
+    variance = scene_variance(index, balanced_thresholds(index), noise)
+    most = max(MOST_NOISE_BETWEEN, NOISE_OF_SCENE * variance)
+    share = min(max(2.0, most / max(noise, 1e-9)) / a_pixel, 1.0)
+    return max(1e-6 * (last - first) * share, 1e-6)

@@ -1,0 +1,81 @@
+"""Rows of the scene's extent: the lens, the box, the space beyond it, and the grid within it."""
+
+from __future__ import annotations
+
+import math
+
+from enerf_ns.choices.poses import corrected_recording
+from enerf_ns.choices.scene import DATAPARSER, Scene
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range, share_beyond
+from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
+
+SHARE_BEYOND = 0.05
+"""Smallest share of the events from beyond the box for which the space there is rendered."""
+
+LARGEST_RESOLUTION = 4096
+"""Largest number of cells along the box that is chosen for the finest level of the hash grid."""
+
+MOST_LEVELS = 10
+"""Largest number of levels that is chosen for the hash grid."""
+
+SMALLEST_GROWTH = 1.4
+"""Smallest factor by which a level of the hash grid is finer than the one before; closer levels hold nearly the
+same."""
+
+
+def undistortion(scene: Scene) -> None:
+    """Are rays and frames undistorted?"""
+    lens = scene.recording.camera.model
+    why = "the calibration states it" if scene.parser.undistort else "set by flag"
+    scene.row("undistortion", lens != "pinhole", lens, why, f"{DATAPARSER}.undistort")
+
+
+def box(scene: Scene) -> None:
+    """Where does the scene lie?"""
+    name, half_cube = f"{DATAPARSER}.depth_range", scene.use(f"{DATAPARSER}.box", lambda: None)
+    scene.use(name, lambda: scene.once(depths))
+    near, far = scene.once(depths)
+    if half_cube is None:
+        value = f"depths {near:.2f} m to {far:.2f} m"
+        why = "the recording states them" if scene.recording.depth_range else "measured from the events"
+        why = scene.why(name, why)
+    else:
+        name = f"{DATAPARSER}.box"
+        value, why = f"cube of {2 * half_cube[3]:g} m", scene.why(name, "")
+    scene.row("box", True, value, why, name)
+    scene.use("model.near_plane", lambda: near * scene.once(scale))
+
+
+def depths(scene: Scene) -> tuple[float, float]:
+    """Nearest and farthest depth of the scene, m."""
+    return scene_depth_range(scene.once(corrected_recording), scene.value(f"{DATAPARSER}.depth_range"))
+
+
+def scale(scene: Scene) -> float:
+    """Units of the network per metre."""
+    return scene_normalisation(scene.recording, *scene.once(depths), scene.value(f"{DATAPARSER}.box"))[1]
+
+
+def contraction(scene: Scene) -> None:
+    """Does the scene go on beyond the box?"""
+    name, near_far = "model.contraction", scene.once(depths)
+    is_set = scene.value(f"{DATAPARSER}.box") is not None
+    share = 0.0 if is_set else share_beyond(scene.recording, near_far)
+    kept = scene.use(name, lambda: share > SHARE_BEYOND)
+    why = "the box is set" if is_set else f"{100 * share:.1f} % of the events come from beyond {near_far[1]:.3g} m"
+    scene.row("contraction", kept, "space beyond the box" * kept, scene.why(name, why), name)
+
+
+def hash_grid(scene: Scene) -> None:
+    """How fine is the hash grid?"""
+    (near, far), coarsest = scene.once(depths), scene.config.model.base_res
+    footprint = math.sqrt(near * far) / scene.recording.camera.fx * scene.once(scale)
+    finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
+    resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))
+    name = "model.num_levels"
+    ratio = max(resolution / coarsest, 1.0)
+    levels = scene.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
+    growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
+    why = f"as fine as the sensor's pixels, each level {growth:.2f} times as fine as the one before"
+    why = scene.why("model.max_res" if scene.config.model.max_res is not None else name, why)
+    scene.row("hash grid", True, f"{levels} levels, {coarsest} to {resolution} cells", why, name)
