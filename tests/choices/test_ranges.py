@@ -23,9 +23,9 @@ from enerf_ns.choices.ranges import check_ranges
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.method.config import enerf
 from enerf_ns.method.trainer import EnerfTrainerConfig
+from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
-from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
 RANGES = ranges.RANGES | SensorModel.ranges()

@@ -15,7 +15,6 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
 
-from enerf_ns.choices.brightness import MEAN_BRIGHTNESS
 from enerf_ns.choices.table import choices_table, recording_table
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.method import trainer as trainer_module
