@@ -24,8 +24,8 @@ AVOIDED = {
 }
 """Expressions that readers stumbled over, and what to write in their place."""
 
-FIRST_WORDS = re.compile(r"(What|Of|Whose|Where|Which)\b")
-"""Words that a docstring does not begin with, since no sentence or name of a thing does."""
+FIRST_WORDS = re.compile(r"(What|Of|Whose|Where|Which)\b(?![^.]*\?)")
+"""Words that a docstring does not begin with, unless it asks a question: no sentence or name of a thing does."""
 
 
 def strings(source: str) -> Iterator[tuple[int, str]]:

@@ -22,7 +22,7 @@ LARGEST_NOISE = 0.1
 
 LARGEST_LAG_MS = 5.0
 """Largest delay (ms) of the events that is attributed to the lag of the pixels, if that is learned. To first order a
-lag and a clock cannot be told apart. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the brightness that it
+lag and a wrong clock have the same effect. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the brightness that it
 sees."""
 
 SMALLEST_DELAY, SMALLEST_SCALE = 2.0, 0.06

@@ -1,4 +1,4 @@
-"""What a resolution is made from and what it holds."""
+"""The values that a resolution is made from, and those that it holds."""
 
 from __future__ import annotations
 

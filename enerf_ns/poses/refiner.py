@@ -127,7 +127,7 @@ BEND = 0.1
 
 @dataclass
 class RefinerConfig:
-    """Which errors of clock, poses and lens are corrected while training. None: the recording decides."""
+    """Selects the errors of clock, poses and lens that training corrects. Default: the recording decides."""
 
     clock_ms: Optional[float] = None  # noqa: UP045
     """Milliseconds by which poses are stamped later than events of the same instant. A value stays fixed. Default:

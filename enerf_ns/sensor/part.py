@@ -39,7 +39,7 @@ class Trained(NamedTuple):
 
 
 class SensorChoices(Protocol):
-    """What the row of a part sees of a scene; `enerf_ns.choices.scene.Scene` has it."""
+    """The view of a scene that the row of a part has. `enerf_ns.choices.scene.Scene` implements it."""
 
     @property
     def recording(self) -> EventRecording:
