@@ -22,8 +22,8 @@ LARGEST_NOISE = 0.1
 
 LARGEST_LAG_MS = 5.0
 """Largest delay (ms) of the events that is attributed to the lag of the pixels, if that is learned. To first order a
-lag and a wrong clock have the same effect. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the brightness that it
-sees."""
+lag and a wrong clock have the same effect. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the brightness
+that it sees."""
 
 SMALLEST_DELAY, SMALLEST_SCALE = 2.0, 0.06
 """Smallest delay (ms) of a clock, and smallest share of the focal length, that are corrected before training; the

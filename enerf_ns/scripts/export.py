@@ -53,7 +53,7 @@ class Export:
         from enerf_ns.export.surface import fused, pixel_size, points_of, surface_views
         from enerf_ns.method.runs import load
         from enerf_ns.report.run_files import read_run
-        from enerf_ns.simulator.scene.mesh_files import load_scene
+        from enerf_ns.simulator.scene.scene_files import load_scene
 
         if self.voxel is not None and not 0.0 < self.voxel < np.inf:
             raise FlagError(f"--voxel is {self.voxel:g}, but must be metres above 0.")
@@ -74,7 +74,7 @@ class Export:
             self._write_poses(load(files.config_file).pipeline, output)
             return
         notes: list[str] = []
-        scene = load_scene(expanded(self.reference), notes) if self.reference else None
+        scene = load_scene(expanded(self.reference), np.random.default_rng(0), notes) if self.reference else None
 
         pipeline = load(files.config_file).pipeline
         path = pipeline.datamanager.recording.path

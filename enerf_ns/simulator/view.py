@@ -17,8 +17,8 @@ from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.sensor.response import response_named
 from enerf_ns.simulator.paper_sequences import PRESETS
-from enerf_ns.simulator.scene.mesh_files import load_scene
 from enerf_ns.simulator.scene.render import Renderer
+from enerf_ns.simulator.scene.scene_files import load_scene
 from enerf_ns.simulator.scene.scenes import SCENES, Scene
 from enerf_ns.simulator.scene.view_check import check_view
 from enerf_ns.simulator.settings import SimulationSettings
@@ -115,16 +115,16 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
     """The scene of settings; the same settings always make the same scene.
 
     Args:
-        settings: Their `scene` is a preset, a name in `SCENES` or a mesh file.
-        notes: As for `mesh_files.load_scene`.
+        settings: Their `scene` is a preset, a name in `SCENES`, a mesh file or a scene file.
+        notes: As for `scene_files.load_scene`.
 
     Raises:
-        RecordingError: The name of the scene is not known, or the mesh file cannot be used.
+        RecordingError: The name of the scene is not known, or the file cannot be used.
     """
-    name = settings.preset.scene or settings.scene
+    name, rng = settings.preset.scene or settings.scene, np.random.default_rng(settings.sensor.seed).spawn(2)[0]
     assert name is not None
     if name in SCENES:
-        scene = SCENES[name](np.random.default_rng(settings.sensor.seed).spawn(2)[0])
+        scene = SCENES[name](rng)
     else:
         path = expanded(name)
         if not path.exists():
@@ -132,7 +132,7 @@ def scene_of(settings: SimulationSettings, notes: list[str]) -> Scene:
                 f"{name} is neither a preset ({', '.join(PRESETS)}) nor a scene ({', '.join(SCENES)}) nor a file or "
                 "folder that exists; give one of these."
             )
-        scene = load_scene(path, notes)
+        scene = load_scene(path, rng, notes)
     return scene if settings.colour or settings.bayer_pattern else scene.grey()
 
 

@@ -1,7 +1,6 @@
-"""Scenes of textured triangles, and the built-in scenes of `enerf simulate`.
+"""The scenes that `enerf simulate` knows: textured triangles, and where the camera stands on average.
 
-World axes: x right, y away from the camera, z up, in metres. In the built-in scenes every camera ray hits a surface
-under every motion. A function that is added to `SCENES` becomes a scene of `engine.simulate`.
+World axes: x right, y away from the camera, z up, in metres. Every camera ray of a scene's motions hits a surface.
 """
 
 from __future__ import annotations
@@ -19,36 +18,37 @@ from enerf_ns.sensor.response import LUMA
 from enerf_ns.simulator.scene import textures
 
 LIGHT = np.array([-0.4, -0.7, 0.6]) / np.linalg.norm([-0.4, -0.7, 0.6])
-"""Unit vector towards the light, which is far away."""
+"""Direction towards the light, far away."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Diffuse triangles: their brightness does not depend on the viewing direction."""
+    """Diffuse triangles whose brightness does not depend on the direction they are seen from."""
 
     triangles: Float32[np.ndarray, "faces 3 3"]
     """Corners of the triangles in metres."""
     uv: Float32[np.ndarray, "faces 3 2"]
-    """Texture coordinates of the corners, to the right and downwards. The texture repeats after 1."""
+    """Texture coordinates of the corners: to the right and downwards, 1 is once across the texture, which repeats."""
     shade: Float32[np.ndarray, "faces 3 channels"]
-    """Light and colour at the corners, at least 0. Brightness is shade times texture. One channel is grey, three
-    channels are linear red, green and blue."""
+    """Light and colour at the corners, at least 0; brightness is shade times texture. One channel is grey, three are
+    linear red, green and blue."""
     texture: Int64[np.ndarray, " faces"]
     """Number of each face's texture."""
     texels: Float32[np.ndarray, "texels channels"]
-    """Linear brightness of the texels: the mip pyramids (see `textures.mip_pyramid`) of all textures in sequence."""
+    """Linear brightness of the texels: the mip pyramids of all textures (see `textures.mip_pyramid`), one after the
+    other."""
     texture_start: Int64[np.ndarray, " textures"]
     """First row of each texture in `texels`."""
     texture_size: Int64[np.ndarray, " textures"]
-    """Texels along one side of the finest level of each texture, a power of two; 1 for a surface of one colour."""
+    """Texels along one side of each texture's finest level, a power of two; 1 for a surface of one colour."""
     texels_per_metre: Float32[np.ndarray, " faces"]
-    """Texels per metre of the finest level on each face; 0 if the whole face has one texture coordinate."""
+    """Texels per metre of the finest level on each face; 0 where the whole face has one texture coordinate."""
     camera: Float64[np.ndarray, "3"]
-    """Mean position of the camera, metres."""
+    """Where the camera stands on average, in metres."""
     target: Float64[np.ndarray, "3"]
-    """Point that the camera looks at, metres."""
+    """What the camera looks at, in metres."""
     background: float = 0.0
-    """Brightness of rays that hit no surface."""
+    """Brightness where a ray hits nothing."""
 
     @property
     def channels(self) -> int:
@@ -56,9 +56,10 @@ class Scene:
         return self.texels.shape[1]
 
     def grey(self) -> Scene:
-        """The scene with the luma (see `response.luma`) in place of each colour.
+        """The scene as a grey camera sees it: with the luma of its colours (see `response.luma`) instead of them.
 
-        The luma of a texture's colour times a corner's colour is approximated by the product of their lumas.
+        The luma of a product of two colours, of a texture's and a corner's, is taken to be the luma of the one times
+        the luma of the other.
         """
         if self.channels == 1:
             return self
@@ -68,7 +69,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles with one texture. Its `shade` and `image` may differ in their number of channels, one or three."""
+    """Triangles with one texture; of its arrays some may be grey and others have three channels."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
     """Corners of the triangles in metres."""
@@ -81,14 +82,7 @@ class Surface:
 
 
 def build_scene(surfaces: list[Surface], camera: ArrayLike, target: ArrayLike, background: float = 0.0) -> Scene:
-    """The scene of some surfaces. Surfaces whose image is the same array share one texture.
-
-    Args:
-        surfaces: At least one.
-        camera: Mean position of the camera [3], metres.
-        target: Point that the camera looks at [3], metres.
-        background: Brightness of rays that hit no surface.
-    """
+    """Puts surfaces together; images that are the same array are held once."""
     channels = max(array.shape[-1] for surface in surfaces for array in (surface.shade, surface.image))
     images = list({id(surface.image): surface.image for surface in surfaces}.values())
     number = {id(image): index for index, image in enumerate(images)}
@@ -114,29 +108,29 @@ def build_scene(surfaces: list[Surface], camera: ArrayLike, target: ArrayLike, b
 
 
 def doubled_areas(corners: np.ndarray) -> np.ndarray:
-    """Twice the areas of triangles [F, 3, D] in the plane (D = 2) or in space (D = 3)."""
+    """Twice the areas of triangles [F, 3, D] in the plane or in space."""
     edges = np.diff(corners.astype(np.float64), axis=1)
     return np.sqrt(np.maximum(np.linalg.det(edges @ edges.swapaxes(1, 2)), 0))
 
 
 def shapes(rng: np.random.Generator) -> Scene:
-    """A room with boxes and balls 1.2 to 2.8 metres away. Some surfaces have no texture."""
+    """A room with boxes and balls between 1.2 and 2.8 metres away; some of its surfaces have no texture."""
     clouds, fine, mosaic = textures.clouds(rng), textures.clouds(rng, 0.4, 0.05), textures.mosaic(rng)
     bricks, lines, text, plain = textures.bricks(rng), textures.lines(rng), textures.text(rng), textures.plain()
     back, floor = 3.3, -0.85
     return build_scene(
         [
             *_room((-2.3, -1.5, floor), (2.3, back, 1.5), bricks, clouds, plain, mosaic),
-            textured(_box((0.9, 0.04, 0.6), (-0.1, back, 0.75)), plain, (0, 0.8)),
-            textured(_box((0.5, 0.5, 0.7), (-0.55, 1.75, floor + 0.35), 25), mosaic, (0.15, 0.95)),
-            textured(_box((0.45, 0.45, 0.45), (0.55, 1.45, floor + 0.225), -20), text, (0.15, 0.9)),
-            textured(_box((0.6, 0.4, 1.1), (1.15, 2.4, floor + 0.55), 15), lines, (0.15, 0.9)),
-            textured(_box((0.3, 0.3, 0.3), (0.0, 2.25, 0.1), 40, 20), plain, (0, 0.8)),
-            textured(_box((0.4, 0.1, 0.5), (-1.35, 2.7, 0.45), 10), text, (0.15, 0.9)),
-            textured(_box((0.5, 0.3, 0.25), (0.75, 2.6, 0.75), -30, 10), fine, (0.2, 0.9)),
-            textured(_ball(0.25, (-0.05, 1.35, floor + 0.25)), lines, (0.2, 0.95)),
-            textured(_ball(0.22, (0.5, 1.9, 0.3)), plain, (0, 0.35)),
-            textured(_ball(0.3, (-0.75, 2.2, 0.35)), clouds, (0.2, 0.8)),
+            _surface(_box((0.9, 0.04, 0.6), (-0.1, back, 0.75)), plain, (0, 0.8)),
+            _surface(_box((0.5, 0.5, 0.7), (-0.55, 1.75, floor + 0.35), 25), mosaic, (0.15, 0.95)),
+            _surface(_box((0.45, 0.45, 0.45), (0.55, 1.45, floor + 0.225), -20), text, (0.15, 0.9)),
+            _surface(_box((0.6, 0.4, 1.1), (1.15, 2.4, floor + 0.55), 15), lines, (0.15, 0.9)),
+            _surface(_box((0.3, 0.3, 0.3), (0.0, 2.25, 0.1), 40, 20), plain, (0, 0.8)),
+            _surface(_box((0.4, 0.1, 0.5), (-1.35, 2.7, 0.45), 10), text, (0.15, 0.9)),
+            _surface(_box((0.5, 0.3, 0.25), (0.75, 2.6, 0.75), -30, 10), fine, (0.2, 0.9)),
+            _surface(_ball(0.25, (-0.05, 1.35, floor + 0.25)), lines, (0.2, 0.95)),
+            _surface(_ball(0.22, (0.5, 1.9, 0.3)), plain, (0, 0.35)),
+            _surface(_ball(0.3, (-0.75, 2.2, 0.35)), clouds, (0.2, 0.8)),
         ],
         camera=(0, 0, 0),
         target=(0, 2, -0.1),
@@ -146,11 +140,11 @@ def shapes(rng: np.random.Generator) -> Scene:
 def carpet(rng: np.random.Generator) -> Scene:
     """A plane of road-like lines, seen at a slant of 60 degrees from 1.5 metres away."""
     plane = _box((16, 16, 0.1), (0, 0, -0.05))
-    return build_scene([textured(plane, textures.lines(rng), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
+    return build_scene([_surface(plane, textures.lines(rng), (0.15, 0.9))], camera=(0, -0.75, 1.3), target=(0, 0, 0))
 
 
 def roads(rng: np.random.Generator) -> Scene:
-    """A plane with the map of a town, in colour, seen at a slant of 60 degrees from 1.5 metres away."""
+    """A plane with the map of a town, in colour, seen as `carpet` is."""
     corners = 20 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     uv = triangles[..., :2] * (1, -1) / textures.EXTENT
@@ -161,7 +155,7 @@ def roads(rng: np.random.Generator) -> Scene:
 def moon(rng: np.random.Generator) -> Scene:
     """A grey landscape of craters under a low sun, seen at a slant of 53 degrees from 1.9 metres away.
 
-    Its mesh is finest at the target, 4 centimetres, and reaches 20 metres. Its texture holds light and shadows.
+    Its mesh is finest, 4 centimetres, at the target and reaches 20 metres; light and shadows are in its texture.
     """
     heights, brightness = textures.moon(rng)
     smooth = gaussian_filter(heights, 8, mode="wrap")
@@ -182,7 +176,7 @@ def moon(rng: np.random.Generator) -> Scene:
 
 
 def board(rng: np.random.Generator) -> Scene:
-    """A desk in a room, with a board 1.3 metres away. Text in many sizes, some of it small, is printed on the board."""
+    """A desk in a room, with a board 1.3 metres away on which text is printed in many sizes, some of it small."""
     bricks, wood, clouds, plain = textures.bricks(rng), textures.wood(rng), textures.clouds(rng), textures.plain()
     lines, text, mosaic = textures.lines(rng), textures.text(rng), textures.mosaic(rng)
     desk = -0.47
@@ -204,16 +198,16 @@ def board(rng: np.random.Generator) -> Scene:
         [
             *_room((-2.4, -1.5, -1.2), (2.4, 2.3, 1.6), bricks, clouds, plain, mosaic),
             page,
-            textured(slab, wood, (0, 0.4)),
-            textured(on_desk((2.6, 1.0, 0.04), 0, 1.2, above=-0.04), wood, (0.1, 0.75)),
-            textured(on_desk((0.3, 0.22, 0.05), -0.66, 0.92, 12), text, (0.1, 0.7)),
-            textured(on_desk((0.26, 0.2, 0.04), -0.66, 0.92, -6, 0.05), mosaic, (0.2, 0.8)),
-            textured(on_desk((0.24, 0.18, 0.06), -0.65, 0.93, 25, 0.09), lines, (0.15, 0.9)),
-            textured(on_desk((0.4, 0.16, 0.02), -0.1, 0.88, 4), mosaic, (0.1, 0.8)),
-            textured(on_desk((0.18, 0.012, 0.012), 0.3, 0.85, 30), plain, (0, 0.85)),
-            textured(on_desk((0.16, 0.012, 0.012), 0.27, 0.92, -15), plain, (0, 0.1)),
-            textured(mug, plain, (0, 0.75)),
-            textured(_ball(0.09, (0.72, 1.05, desk + 0.09)), mosaic, (0.15, 0.95)),
+            _surface(slab, wood, (0, 0.4)),
+            _surface(on_desk((2.6, 1.0, 0.04), 0, 1.2, above=-0.04), wood, (0.1, 0.75)),
+            _surface(on_desk((0.3, 0.22, 0.05), -0.66, 0.92, 12), text, (0.1, 0.7)),
+            _surface(on_desk((0.26, 0.2, 0.04), -0.66, 0.92, -6, 0.05), mosaic, (0.2, 0.8)),
+            _surface(on_desk((0.24, 0.18, 0.06), -0.65, 0.93, 25, 0.09), lines, (0.15, 0.9)),
+            _surface(on_desk((0.4, 0.16, 0.02), -0.1, 0.88, 4), mosaic, (0.1, 0.8)),
+            _surface(on_desk((0.18, 0.012, 0.012), 0.3, 0.85, 30), plain, (0, 0.85)),
+            _surface(on_desk((0.16, 0.012, 0.012), 0.27, 0.92, -15), plain, (0, 0.1)),
+            _surface(mug, plain, (0, 0.75)),
+            _surface(_ball(0.09, (0.72, 1.05, desk + 0.09)), mosaic, (0.15, 0.95)),
         ],
         camera=(0, -0.1, 0),
         target=(0, 1.2, -0.08),
@@ -223,41 +217,39 @@ def board(rng: np.random.Generator) -> Scene:
 SCENES = {"shapes": shapes, "carpet": carpet, "roads": roads, "moon": moon, "board": board}
 
 
-def diffuse_light(normals: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3 1"]:
-    """The light on corners with these unit normals: 0.7 from everywhere, and up to 0.3 from `LIGHT`."""
-    return 0.7 + 0.3 * np.maximum(normals @ LIGHT, 0)[..., None]
+def diffuse_light(
+    normals: Float[np.ndarray, "faces 3 3"], light: Float[np.ndarray, "3"] = LIGHT
+) -> Float[np.ndarray, "faces 3 1"]:
+    """What falls on corners with these unit normals: 0.7 from everywhere, and up to 0.3 from a light far away.
+
+    Args:
+        light: unit vector towards it.
+    """
+    return 0.7 + 0.3 * np.maximum(normals @ light, 0)[..., None]
 
 
 def corner_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 3"]:
-    """Unit normals at the corners of all faces: smoothed over edges of up to 40 degrees, else normals of the face."""
+    """Unit normals at the corners of all faces: of the smoothed surface, at edges above 40 degrees of the face."""
     smooth, flat = mesh.vertex_normals[mesh.faces], mesh.face_normals[:, None]
     return np.where((smooth * flat).sum(-1, keepdims=True) > np.cos(np.radians(40)), smooth, flat)
 
 
-def _texture_coordinates(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 2"]:
-    """Texture coordinates to the right and downwards, in metres, along the two axes that each face lies closest to.
-
-    A texture is upright and not mirrored as seen from outside.
-    """
-    across = np.abs(mesh.face_normals).argmax(1)
+def texture_coordinates(
+    triangles: Float[np.ndarray, "faces 3 3"], face_normals: Float[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 2"]:
+    """Texture coordinates to the right and downwards, in the unit of the corners, along the two axes that a face lies
+    closest to: a texture is upright and not mirrored from outside."""
+    across = np.abs(face_normals).argmax(1)
     faces = np.arange(len(across))
-    outwards = np.sign(mesh.face_normals[faces, across]) * np.array([1, -1, 1])[across]
+    outwards = np.sign(face_normals[faces, across]) * np.array([1, -1, 1])[across]
     to_right, up = np.array([1, 0, 0])[across], np.array([2, 2, 1])[across]
-    return np.stack([outwards[:, None] * mesh.triangles[faces, :, to_right], -mesh.triangles[faces, :, up]], axis=-1)
+    return np.stack([outwards[:, None] * triangles[faces, :, to_right], -triangles[faces, :, up]], axis=-1)
 
 
-def textured(
-    mesh: trimesh.Trimesh, levels: Float32[np.ndarray, "size size"], brightness: tuple[float, float]
-) -> Surface:
-    """The surface of a mesh, lit, with a texture that repeats every `textures.EXTENT` metres.
-
-    Args:
-        mesh: In metres, z up.
-        levels: Texture in [0, 1], as the functions of `textures` return them; `size` is a power of two.
-        brightness: Linear brightness of the levels 0 and 1.
-    """
+def _surface(mesh: trimesh.Trimesh, levels: np.ndarray, brightness: tuple[float, float]) -> Surface:
+    """A mesh in a procedural texture [size, size] whose zeros and ones get the given brightness."""
     dark, bright = brightness
-    uv = _texture_coordinates(mesh) / textures.EXTENT
+    uv = texture_coordinates(mesh.triangles, mesh.face_normals) / textures.EXTENT
     image = (dark + (bright - dark) * levels)[..., None]
     return Surface(mesh.triangles, uv, diffuse_light(corner_normals(mesh)), image)
 
@@ -265,7 +257,7 @@ def textured(
 def _room(
     lower: tuple, upper: tuple, back: np.ndarray, floor: np.ndarray, plain: np.ndarray, right: np.ndarray
 ) -> list[Surface]:
-    """The inner sides of a box between two corners, with textures."""
+    """The inner sides of a box between two corners, in textures."""
     room = trimesh.creation.box(bounds=[lower, upper])
     room.invert()
     room.unmerge_vertices()
@@ -274,12 +266,12 @@ def _room(
         return trimesh.Trimesh(room.vertices, room.faces[room.face_normals @ normal > 0.5], process=False)
 
     return [
-        textured(wall(0, -1, 0), back, (0.3, 0.6)),
-        textured(wall(0, 0, 1), floor, (0.35, 0.65)),
-        textured(wall(1, 0, 0), plain, (0, 0.5)),
-        textured(wall(-1, 0, 0), right, (0.3, 0.6)),
-        textured(wall(0, 0, -1), plain, (0, 0.8)),
-        textured(wall(0, 1, 0), plain, (0, 0.5)),
+        _surface(wall(0, -1, 0), back, (0.3, 0.6)),
+        _surface(wall(0, 0, 1), floor, (0.35, 0.65)),
+        _surface(wall(1, 0, 0), plain, (0, 0.5)),
+        _surface(wall(-1, 0, 0), right, (0.3, 0.6)),
+        _surface(wall(0, 0, -1), plain, (0, 0.8)),
+        _surface(wall(0, 1, 0), plain, (0, 0.5)),
     ]
 
 

@@ -1,11 +1,12 @@
-"""Procedural textures, drawn by a generator: square, grey or R G B, with levels from 0 (darkest) to 1 (brightest)."""
+"""Procedural textures, made from a seed: square, grey or in colour, 0 where they are darkest and 1 where brightest."""
 
 from __future__ import annotations
 
 import string
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,17 +19,17 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 SIZE = 1024
-"""Texels along one side of a texture, unless its function states another size."""
+"""Texels along one side of a texture, unless the texture's description says otherwise."""
 TEXELS_PER_METRE = 256
 EXTENT = SIZE / TEXELS_PER_METRE
-"""Metres after which a texture of `SIZE` texels repeats."""
+"""Metres that a texture of `SIZE` texels covers before it repeats."""
 
 Colour = Sequence[float]
 """Red, green and blue, each from 0 to 255."""
 
 
 def plain() -> np.ndarray:
-    """A texture of one texel with level 1."""
+    """No texture at all."""
     return np.ones((1, 1), np.float32)
 
 
@@ -66,7 +67,7 @@ def lines(rng: np.random.Generator, count: int = 30, background: float = 0.35) -
     for _ in range(count):
         ends = rng.integers(-SIZE // 4, SIZE + SIZE // 4, (2, 2))
         grey, width = float(rng.choice([0.0, 0.7, 1.0])), int(rng.integers(8, 32))
-        for shift in np.ndindex(3, 3):  # strokes that leave at one border enter at the opposite one
+        for shift in np.ndindex(3, 3):  # what leaves at one border comes in at the opposite one
             start, end = ends + SIZE * (np.array(shift) - 1)
             cv2.line(image, start.tolist(), end.tolist(), (grey,), width, cv2.LINE_AA)
     return image
@@ -125,18 +126,18 @@ def roads(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048 3"]:
 
 @dataclass(frozen=True)
 class _Map:
-    """A canvas of EXTENT x EXTENT metres. Drawings that leave it at one border enter at the opposite border."""
+    """A picture of EXTENT by EXTENT metres to draw on; what leaves it at one border enters at the opposite one."""
 
     pixels: np.ndarray
-    """Texels of the canvas, uint8 [size, size, 3]."""
+    """Texels of the picture, uint8 [size, size, 3]."""
 
     def area(self, corners: np.ndarray, colour: Colour) -> None:
-        """Fills a polygon with corners [N, 2], metres."""
+        """Fills a polygon [N, 2]."""
         for points in self._copies(corners, 0):
             cv2.fillPoly(self.pixels, [points], colour)
 
     def stroke(self, points: np.ndarray, width: float, colour: Colour) -> None:
-        """Draws a line along points [N, 2]; points and width in metres."""
+        """A line along points [N, 2]."""
         for copy in self._copies(points, width):
             cv2.polylines(self.pixels, [copy], False, colour, max(self._texels(width), 1))
 
@@ -145,7 +146,7 @@ class _Map:
             cv2.circle(self.pixels, point.tolist(), self._texels(radius), colour, cv2.FILLED)
 
     def _copies(self, points: np.ndarray, width: float) -> Iterator[np.ndarray]:
-        """Those of nine copies of a drawing, each shifted by EXTENT, that touch the canvas, in texels."""
+        """Whichever of the nine neighbours of what is drawn with a width (metres) touch the picture, in its texels."""
         for shift in np.ndindex(3, 3):
             moved = points + EXTENT * (np.array(shift) - 1)
             if (moved.max(0) > -width).all() and (moved.min(0) < EXTENT + width).all():
@@ -156,7 +157,7 @@ class _Map:
 
 
 def _closed_curve(points: np.ndarray, period: tuple[float, float], steps: int) -> np.ndarray:
-    """A smooth line [N * steps + 1, 2] through points [N, 2] that repeats after N points, shifted by `period`."""
+    """A smooth line [N * steps + 1, 2] through points [N, 2], which begins again after the last, `period` further."""
     knots = np.arange(len(points) + 1)
     drift = np.outer(knots, period) / len(points)
     offsets = np.concatenate([points, points[:1]]) - drift
@@ -166,7 +167,7 @@ def _closed_curve(points: np.ndarray, period: tuple[float, float], steps: int) -
 
 
 def _inside(corners: np.ndarray, across: ArrayLike, down: ArrayLike) -> np.ndarray:
-    """Points [..., 2] of a block with corners [2 (down), 2 (across), 2], at fractions of its width and height."""
+    """Points [..., 2] of a block with corners [2 (down), 2 (across), 2], at shares of its width and of its height."""
     across, down = np.asarray(across)[..., None], np.asarray(down)[..., None]
     top, bottom = ((1 - across) * corners[row, 0] + across * corners[row, 1] for row in (0, 1))
     return (1 - down) * top + down * bottom
@@ -201,7 +202,7 @@ def _draw_tree(town: _Map, centre: np.ndarray, rng: np.random.Generator) -> None
 
 
 def _draw_houses(town: _Map, outline: np.ndarray, corners: np.ndarray, rng: np.random.Generator) -> None:
-    """Draws rows of plots. Most have a house with a roof that is darker on one side; the others have trees."""
+    """Plots in rows, most with a house whose roof is darker on one side, the others with trees."""
     town.area(outline, [(206, 192, 160), (176, 184, 140), (196, 196, 192)][rng.integers(3)])
     columns, rows = rng.integers(2, 6, 2)
     for column, row in np.ndindex(columns, rows):
@@ -226,8 +227,7 @@ def _draw_houses(town: _Map, outline: np.ndarray, corners: np.ndarray, rng: np.r
 
 
 def _draw_markings(town: _Map, line: np.ndarray, width: float, across: np.ndarray, steps: int) -> None:
-    """Draws centre and edge lines of a street, and zebra crossings before each street of width `across` that it
-    meets."""
+    """Centre and edge lines of a street, and zebra crossings before each street of width `across` that it meets."""
     travelled = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
     along = np.linspace(0, travelled[-1], round(travelled[-1] / 0.004))
     points = np.stack([np.interp(along, travelled, line[:, axis]) for axis in (0, 1)], -1)
@@ -293,7 +293,7 @@ SENTENCES = (
 
 
 def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
-    """A printed page, to be shown 4 wide by 3 high: title, alphabet, columns of text in six sizes, and an eye chart."""
+    """A printed page four thirds as wide as high: a title, the letters, columns of text in six sizes, an eye chart."""
     fonts = Path(get_data_path()) / "fonts" / "ttf"
     width, height = 2732, 2049
     image = Image.new("L", (width, height), 255)
@@ -303,7 +303,7 @@ def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
         return ImageFont.truetype(str(fonts / f"{name}.ttf"), size)
 
     def paragraph(left: float, top: float, right: float, bottom: float, name: str, size: float) -> None:
-        """Draws sentences in random order, as many lines as fit."""
+        """Sentences in any order, as many lines as there is room for."""
         face, line, space = font(name, size), "", 1.3 * size
         words = " ".join(rng.permutation(np.tile(SENTENCES, 12))).split()
         for word in words:
@@ -340,16 +340,16 @@ def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
 
 
 MOON_EXTENT = 6.0
-"""Metres after which the textures of `moon` repeat."""
+"""Metres that the textures of `moon` cover before they repeat."""
 
 
 def moon(
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "2048 2048"], Float32[np.ndarray, "2048 2048"]]:
-    """Heights in metres and brightness of a landscape of craters; downwards in both arrays is the direction -y.
+    """Heights in metres, downwards in the picture being towards -y, and brightness of a landscape of craters.
 
-    The number of craters decreases with the square of their radius. Between them the ground is fractal, with boulders.
-    The sun stands 24 degrees above the horizon in the direction of -x and casts shadows.
+    The craters' number falls with the square of their radius; between them the ground is rough as a fractal, with
+    boulders. The sun stands 24 degrees above the horizon in the direction of -x; there are shadows.
     """
     size = 2048
     cell = MOON_EXTENT / size
@@ -359,16 +359,13 @@ def moon(
     heights = (0.03 * (rough - rough.mean()) / rough.std()).astype(np.float32)
 
     def around(centre: np.ndarray, radius: float, reach: float) -> tuple[tuple, np.ndarray]:
-        """Indices of the texels within `reach` radii of a centre, and their distance from it in radii.
-
-        The outline of large circles is ragged.
-        """
+        """Which texels lie within `reach` radii of a place, and how far away, in radii, of a ragged circle."""
         half = int(np.ceil(reach * radius / cell))
         offsets = np.arange(-half, half + 1)
         column, row = np.floor(centre / cell).astype(int)
         shift = offsets * cell / radius
         distance = np.hypot(shift, shift[:, None])
-        if half < 20:  # its outline is too small to be visible
+        if half < 20:  # too small for its outline to be seen
             return np.ix_((row + offsets) % size, (column + offsets) % size), distance
         angle = np.arctan2(shift[:, None], shift)
         waves, phases = rng.uniform(0, 0.06, 3), rng.uniform(0, 2 * np.pi, 3)
@@ -402,22 +399,46 @@ def moon(
     return heights, brightness.clip(0, 1).astype(np.float32)
 
 
+class Procedural(NamedTuple):
+    """How a texture is made by its name, and how it is put on a surface."""
+
+    make: Callable[[np.random.Generator], np.ndarray]
+    """Function that draws the texture, float32 [size, size] or [size, size, 3]."""
+    extent: float | None
+    """Metres that the texture covers before it repeats; None: it is stretched once over a side."""
+    brightness: tuple[float, float]
+    """Brightness of the texture's zeros and ones where none is asked for."""
+
+
+PROCEDURAL = {
+    "plain": Procedural(lambda _: plain(), EXTENT, (0.15, 0.9)),
+    "clouds": Procedural(clouds, EXTENT, (0.15, 0.9)),
+    "mosaic": Procedural(mosaic, EXTENT, (0.15, 0.9)),
+    "bricks": Procedural(bricks, EXTENT, (0.15, 0.9)),
+    "lines": Procedural(lines, EXTENT, (0.15, 0.9)),
+    "text": Procedural(text, EXTENT, (0.15, 0.9)),
+    "wood": Procedural(wood, EXTENT, (0.15, 0.9)),
+    "page": Procedural(page, None, (0.15, 0.9)),
+    "roads": Procedural(roads, EXTENT, (0, 1)),
+    "moon": Procedural(lambda rng: moon(rng)[1], MOON_EXTENT, (0, 1)),
+}
+
+
 def square(image: Float[np.ndarray, "height width channels"], size: int) -> Float32[np.ndarray, "size size channels"]:
-    """An image of any size stretched to size x size: by area means where it shrinks, by interpolation where it
-    grows."""
+    """An image of any size, stretched: area means where it shrinks, linear interpolation where it grows."""
     height, width, channels = image.shape
     small = cv2.resize(image.astype(np.float32), (min(width, size), min(height, size)), interpolation=cv2.INTER_AREA)
     return cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR).reshape(size, size, channels)
 
 
 def mip_pyramid(image: Float[np.ndarray, "size size channels"]) -> Float32[np.ndarray, "texels channels"]:
-    """All levels of a texture, finest first. Each level holds the means of 2 x 2 texels of the level before.
+    """All levels of a texture, finest first, each the mean of 2 x 2 texels of the one before, down to one texel.
 
     Args:
-        image: Finest level; `size` is a power of two.
+        image: its size is a power of two.
 
     Returns:
-        (4 * size**2 - 1) / 3 texels. The level of n x n texels starts at row 4 * (size**2 - n**2) / 3.
+        (4 * size**2 - 1) / 3 texels; the level of n x n texels starts at row 4 * (size**2 - n**2) / 3.
     """
     levels = [image.astype(np.float32)]
     while len(levels[-1]) > 1:

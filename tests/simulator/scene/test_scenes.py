@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.simulator.scene import textures
-from enerf_ns.simulator.scene.mesh_files import load_scene
 from enerf_ns.simulator.scene.render import Renderer
-from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene, corner_normals, textured
+from enerf_ns.simulator.scene.scene_files import load_scene
+from enerf_ns.simulator.scene.scenes import SCENES, Scene, Surface, build_scene, corner_normals
 
 RNG = np.random.default_rng
 
@@ -31,15 +31,17 @@ QUAD = np.array([[-1.0, 0.5], [1, 0.5], [1, -0.5], [-1, -0.5]])
 FORWARD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """Pose of a camera at the origin that looks along y, with z upwards."""
 
+UNLIT = {"light": None}
+
 
 def to_linear(value: float) -> float:
     """The sRGB transfer function as IEC 61966-2-1 has it."""
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def load(path: Path) -> tuple[Scene, list[str]]:
+def load(path: Path, seed: int = 0) -> tuple[Scene, list[str]]:
     notes: list[str] = []
-    return load_scene(path, notes), notes
+    return load_scene(path, RNG(seed), notes), notes
 
 
 def write_picture(path: Path, scale: int = 32) -> None:
@@ -130,11 +132,22 @@ def write_glb(folder: Path) -> Path:
     return folder / "quad.glb"
 
 
-@pytest.mark.parametrize("write", [write_obj, write_ply, write_gltf, write_glb])
+def write_scene(folder: Path, *parts: dict[str, Any], **about: Any) -> Path:
+    (folder / "scene.json").write_text(json.dumps({"parts": parts, **about}))
+    return folder / "scene.json"
+
+
+def write_plane_with_picture(folder: Path) -> Path:
+    write_picture(folder / "picture.png")
+    wall = {"shape": "plane", "size": [2, 1], "position": [0, 2, 0], "rotation": [90, 0, 0], "texture": "picture.png"}
+    return write_scene(folder, wall, **UNLIT)
+
+
+@pytest.mark.parametrize("write", [write_obj, write_ply, write_gltf, write_glb, write_plane_with_picture])
 def test_a_picture_is_seen_upright_and_in_linear_brightness(tmp_path, write):
     scene, notes = load(write(tmp_path))
     seen = Renderer(scene, Camera(40, 20, 40.0, 40.0, 19.5, 9.5)).brightness(FORWARD)
-    light = 0.7 + 0.3 * 0.7 / np.sqrt(0.4**2 + 0.7**2 + 0.6**2)
+    light = 1.0 if write is write_plane_with_picture else 0.7 + 0.3 * 0.7 / np.sqrt(0.4**2 + 0.7**2 + 0.6**2)
     for row, column in np.ndindex(2, 2):
         expected = [light * to_linear(value / 255) for value in COLOURS[row, column].tolist()]
         inside = seen[10 * row + 2 : 10 * row + 8, 20 * column + 2 : 20 * column + 18]
@@ -288,13 +301,54 @@ def test_normals_are_those_of_the_faces_at_sharp_edges_and_smooth_elsewhere():
     np.testing.assert_allclose(corner_normals(ball), ball.triangles / 2, atol=0.01)
 
 
-def test_a_mesh_is_looked_at_from_above_and_all_is_seen(tmp_path):
-    import trimesh
+def test_parts_stand_where_the_scene_file_puts_them(tmp_path):
+    write_obj(tmp_path)
+    path = write_scene(
+        tmp_path,
+        {"shape": "box", "size": [0.2, 0.4, 0.6], "position": [1, 2, 3], "rotation": [20, -30, 50]},
+        {"shape": "ball", "size": 0.5, "position": [-1, 4, 0], "texture": "clouds", "brightness": [0.2, 0.7]},
+        {"shape": "plane", "size": [4, 3], "rotation": [0, 0, 90], "texture": "page"},
+        {"shape": "quad.obj", "size": 0.5, "position": [0, 0, 9], "rotation": [0, 0, 180]},
+        camera=[0, -3, 1],
+        target=[0, 1, 0.5],
+        background=0.4,
+    )
+    scene, notes = load(path)
+    assert not notes and scene.background == 0.4 and scene.channels == 3
+    np.testing.assert_array_equal([scene.camera, scene.target], [[0, -3, 1], [0, 1, 0.5]])
+    box, ball, plane, quad = (scene.triangles[scene.texture == k] for k in range(4))
+    corners = np.array(np.meshgrid([-0.1, 0.1], [-0.2, 0.2], [-0.3, 0.3])).reshape(3, -1).T
+    corners = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).apply(corners) + np.array([1, 2, 3])
+    distances = np.linalg.norm(box.reshape(-1, 1, 3) - corners, axis=2)
+    assert distances.min(1).max() < 1e-5 and distances.min(0).max() < 1e-5
+    np.testing.assert_allclose(np.linalg.norm(ball - (-1, 4, 0), axis=2), 0.25, atol=1e-5)
+    np.testing.assert_allclose([plane.min((0, 1)), plane.max((0, 1))], [[-1.5, -2, 0], [1.5, 2, 0]], atol=1e-6)
+    np.testing.assert_allclose(quad.min((0, 1)), [-0.25, -0.5, 8.875], atol=1e-6)
+    np.testing.assert_allclose(quad.max((0, 1)), [0.25, -0.5, 9.125], atol=1e-6)
+    clouds = scene.texels[scene.texture_start[1] :][: 1024**2]
+    np.testing.assert_allclose([clouds.min(), clouds.max()], [0.2, 0.7], atol=1e-6)
+    np.testing.assert_allclose(scene.texels_per_metre[scene.texture == 2], 2048 / np.sqrt(12), rtol=1e-6)
+    np.testing.assert_allclose(scene.texels[scene.texture_start[0]], 0.9)
 
-    boxes = [trimesh.creation.box(bounds=[(x, y, 0), (x + 1, y + 1, 1)]) for x in (-2, 2) for y in (3, 7)]
-    trimesh.util.concatenate(boxes).export(tmp_path / "boxes.ply")
-    scene, _ = load(tmp_path / "boxes.ply")
-    np.testing.assert_allclose(scene.target, [0.5, 5.5, 0.5], atol=1e-6)
+
+def test_an_inward_part_looks_inwards_and_light_falls_on_its_inside(tmp_path):
+    box = {"shape": "box", "size": [4, 4, 4], "texture": "plain", "brightness": [1, 1]}
+    about = {"camera": [0, 0, 0], "target": [0, 1, 0], "light": [0, 0, 1]}
+    volumes, floors = [], []
+    for inward in (False, True):
+        path = tmp_path / f"{inward}.json"
+        path.write_text(json.dumps({"parts": [{**box, "inward": inward}], **about}))
+        scene, _ = load(path)
+        volumes.append(np.linalg.det(scene.triangles).sum() / 6)
+        floors.append(scene.shade[(scene.triangles[..., 2] < -1.9).all(1)])
+    np.testing.assert_allclose(volumes, [64, -64], rtol=1e-6)
+    assert (floors[1] > 0.99).all() and (floors[0] < 0.71).all()
+
+
+def test_a_scene_file_without_a_camera_is_looked_at_from_above_and_all_is_seen(tmp_path):
+    parts = ({"shape": "box", "position": [x, y, 0.5]} for x in (-2, 2) for y in (3, 7))
+    scene, _ = load(write_scene(tmp_path, *parts))
+    np.testing.assert_allclose(scene.target, [0, 5, 0.5], atol=1e-6)
     offset = scene.camera - scene.target
     assert offset[0] == 0 and offset[1] < 0 < offset[2]
     forward = -offset / np.linalg.norm(offset)
@@ -302,34 +356,22 @@ def test_a_mesh_is_looked_at_from_above_and_all_is_seen(tmp_path):
     assert (rays @ forward / np.linalg.norm(rays, axis=1)).min() > np.cos(np.radians(30))
 
 
-def test_a_mirrored_node_keeps_its_faces_outwards_and_its_picture(tmp_path):
-    about = gltf_quad()
-    about["nodes"][0]["scale"] = [-1, 1, 1]
+def test_a_picture_lies_once_on_each_side_of_a_box_and_is_not_mirrored(tmp_path):
     write_picture(tmp_path / "picture.png")
-    (tmp_path / "quad.gltf").write_text(json.dumps(about))
-    scene, _ = load(tmp_path / "quad.gltf")
-    seen = Renderer(scene, Camera(40, 20, 40.0, 40.0, 19.5, 9.5)).brightness(FORWARD)
-    normals = np.cross(scene.triangles[:, 1] - scene.triangles[:, 0], scene.triangles[:, 2] - scene.triangles[:, 0])
-    assert (normals[:, 1] < 0).all()
-    plain, _ = load(write_gltf(tmp_path))
-    mirrored = Renderer(plain, Camera(40, 20, 40.0, 40.0, 19.5, 9.5)).brightness(FORWARD)[:, ::-1]
-    for row, column in np.ndindex(2, 2):
-        inside = slice(10 * row + 2, 10 * row + 8), slice(20 * column + 2, 20 * column + 18)
-        np.testing.assert_allclose(seen[inside], mirrored[inside], atol=1e-5)
-
-
-def test_a_texture_is_upright_and_not_mirrored_on_each_side_of_a_box():
-    import trimesh
-
-    surface = textured(trimesh.creation.box((2, 4, 1)), textures.plain(), (0, 1))
-    edges, steps = np.diff(surface.triangles, axis=1), np.diff(surface.uv, axis=1)
+    box = {"shape": "box", "size": [2, 4, 1], "texture": "picture.png"}
+    scene, _ = load(write_scene(tmp_path, box, camera=[0, -9, 0], **UNLIT))
+    np.testing.assert_allclose(np.ptp(scene.uv, axis=1), 1, atol=1e-6)
+    corners, uv = scene.triangles.astype(float), scene.uv.astype(float)
+    edges, steps = corners[:, 1:] - corners[:, :1], uv[:, 1:] - uv[:, :1]
     # to the right crossed with downwards points into the box
-    along = np.linalg.solve(steps, edges) / textures.EXTENT
+    along = np.linalg.solve(steps, edges)
     inwards = np.cross(along[:, 0], along[:, 1])
-    assert ((inwards * surface.triangles.mean(1)).sum(1) < 0).all()
+    assert ((inwards * corners.mean(1)).sum(1) < 0).all()
     sides = np.abs(inwards[:, 2]) < 1e-6
     np.testing.assert_allclose(along[sides, 1], np.tile([0, 0, -1], (8, 1)), atol=1e-6)
 
+
+BOX = {"shape": "box"}
 
 SHORT_PLY = PLY.format(vertex="", face="", rows="0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n").replace("face 1", "face 2")
 
@@ -357,6 +399,10 @@ def named(name: str, content: str | bytes) -> Callable[[Path], Path]:
     return write
 
 
+def scene_of(*parts: Any, **about: Any) -> Callable[[Path], Path]:
+    return lambda folder: write_scene(folder, *parts, **about)
+
+
 def without_picture(folder: Path) -> Path:
     path = write_obj(folder)
     (folder / "picture.png").unlink()
@@ -380,7 +426,7 @@ def without_materials(folder: Path) -> Path:
     [
         (lambda folder: folder / "none.glb", ("none.glb is missing",)),
         (lambda folder: folder, ("of a mesh was expected",)),
-        (named("a.json", "{}"), ("a.json is of a type", ".glb")),
+        (lambda folder: folder / "none.json", ("none.json is missing",)),
         (named("a.blend", "BLENDER"), ("a.blend is of a type", ".obj")),
         (named("a.obj", ""), ("a.obj holds no mesh with faces",)),
         (named("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"), ("a.obj holds no mesh with faces",)),
@@ -407,9 +453,37 @@ def without_materials(folder: Path) -> Path:
         (corrupted(lambda about: about["meshes"][0]["primitives"][0].pop("attributes")), ("cannot be read as glTF",)),
         (corrupted(lambda about: about["bufferViews"][0].update(byteLength=10**6)), ("cannot be read as a mesh",)),
         (corrupted(lambda about: about["nodes"][0].pop("mesh")), ("holds no mesh with faces",)),
+        (named("a.json", "{"), ("a.json cannot be read as JSON",)),
+        (named("a.json", "[]"), ("a.json holds a list",)),
+        (named("a.json", "{}"), ("a.json holds parts = null", "at least one part")),
+        (scene_of(), ("holds parts = []",)),
+        (scene_of(7), ("scene.json, part 1, is 7",)),
+        (scene_of(BOX, {}), ("part 2, holds shape = null", "plane")),
+        (scene_of({"shape": "cube"}), ('shape = "cube"', "box, ball, plane")),
+        (scene_of({"shape": "chair.glb"}), ("chair.glb is missing",)),
+        (scene_of({**BOX, "sise": 1}), ('holds "sise"', "size, position")),
+        (scene_of(BOX, colour=1), ('holds "colour"', "background")),
+        (scene_of({**BOX, "size": 2}), ("size = 2", "3 numbers")),
+        (scene_of({**BOX, "size": [1, 0, 1]}), ("size = [1, 0, 1]",)),
+        (scene_of({"shape": "ball", "size": [1]}), ("size = [1]", "a number")),
+        (scene_of({**BOX, "position": [0, 1, float("nan")]}), ("position = [0, 1, NaN]",)),
+        (scene_of({**BOX, "rotation": "x"}), ('rotation = "x"',)),
+        (scene_of({**BOX, "rotation": [0, True, 10**400]}), ("rotation = [0, true, 1000",)),
+        (scene_of({**BOX, "texture": "marble"}), ('texture = "marble"', "clouds, mosaic")),
+        (scene_of({**BOX, "texture": 3}), ("texture = 3",)),
+        (scene_of({**BOX, "texture": "marble.png"}), ("marble.png",)),
+        (scene_of({**BOX, "brightness": [0, -1]}), ("brightness = [0, -1]",)),
+        (scene_of({"shape": "quad.obj", "brightness": [0, 1]}), ("holds brightness, but no texture",)),
+        (scene_of(BOX, camera=[0, 1]), ("camera = [0, 1]",)),
+        (scene_of(BOX, camera=[0, 0, 3], target=[0, 0, 0]), ("camera at [0.0, 0.0, 3.0]", "right above")),
+        (scene_of(BOX, camera=[0, 1, 3], target=[0, 1, 3]), ("must be apart",)),
+        (scene_of(BOX, background=-0.1), ("background = -0.1",)),
+        (scene_of(BOX, light=[0, 0, 0]), ("no direction",)),
     ],
 )
 def test_a_scene_that_cannot_be_is_refused_in_one_sentence(tmp_path, write, said):
+    if "brightness" in said[0]:
+        write_obj(tmp_path)
     with pytest.raises(RecordingError) as error:
         load(write(tmp_path))
     message = str(error.value)
@@ -443,6 +517,12 @@ def same(first: Scene, second: Scene) -> bool:
     return all(np.array_equal(vars(first)[name], vars(second)[name]) for name in vars(first))
 
 
+def test_the_same_seed_makes_the_same_scene(tmp_path):
+    path = write_scene(tmp_path, {**BOX, "texture": "lines"}, {**BOX, "texture": "page", "position": [2, 0, 0]})
+    assert same(load(path, 3)[0], load(path, 3)[0])
+    assert not same(load(path, 3)[0], load(path, 4)[0])
+
+
 @pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
@@ -473,9 +553,8 @@ def test_shadows_of_the_moon_fall_where_the_ground_is_in_the_way_of_the_sun():
 def test_pictures_of_any_size_become_squares_that_show_the_same(tmp_path, shape, size):
     width = shape[1]
     ramp = np.broadcast_to(np.linspace(40, 200, width).round().astype(np.uint8), shape)
-    path = write_obj(tmp_path)
     Image.fromarray(np.ascontiguousarray(ramp)).save(tmp_path / "picture.png")
-    scene, _ = load(path)
+    scene, _ = load(write_scene(tmp_path, {"shape": "plane", "texture": "picture.png"}))
     assert scene.channels == 1 and scene.texture_size.tolist() == [size]
     image = scene.texels[: size**2, 0].reshape(size, size)
     assert np.ptp(image, axis=0).max() < 1e-6
