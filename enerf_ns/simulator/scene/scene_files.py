@@ -1,14 +1,16 @@
-"""Scenes from files: a mesh in any format that trimesh loads, or a JSON file that puts parts together.
+"""Scenes from files: a mesh file, or a scene file in JSON that puts parts together.
 
-Mesh (glTF .glb and .gltf, .obj with .mtl, .ply, .stl, .off, .dae, .3mf ...; some need further packages of trimesh's):
-    All meshes of the file are taken, each where the file's graph of nodes places it. Metres; z is up, except in glTF,
-    whose y is up by definition and is turned to z. The picture of a material (baseColorTexture, map_Kd, TextureFile)
-    is taken from sRGB to linear brightness, stretched to a square of a power of two of at most 2048 texels, and repeats
-    outside of [0, 1]. In glTF it is multiplied by baseColorFactor and COLOR_0. Where there are no texture coordinates
-    the colours of vertices or faces are taken (linear in glTF, sRGB elsewhere), or else the material's, or else a grey
-    of 0.8, and a note says so. Transparency and all other properties of materials are ignored.
+A mesh file may be of any format that trimesh loads: glTF (.glb, .gltf), .obj with .mtl, .ply, .stl, .off, .dae, .3mf
+and others; trimesh needs further packages for some of them. All meshes of the file are taken, each where the file's
+scene graph places it. Units are metres, and z is up. In glTF y is up by definition, so y is turned to z.
 
-Scene file (.json), paths relative to its folder; everything but `parts` and `shape` may be left out:
+The picture of a material (baseColorTexture, map_Kd, TextureFile) is converted from sRGB to linear brightness and
+stretched to a square of a power of two of at most 2048 texels. It repeats outside of [0, 1]. In glTF it is multiplied
+by baseColorFactor and COLOR_0. A mesh without texture coordinates shows the colours of its vertices or faces (linear in
+glTF, sRGB elsewhere), or else the colour of its material, or else a grey of 0.8; a note tells the user so. Transparency
+and all other properties of materials are ignored.
+
+A scene file (.json) is an object like this one. Paths are relative to the folder of the scene file:
     {
       "parts": [
         {"shape": "models/chair.glb", "size": 0.9, "position": [0.5, 2, 0], "rotation": [0, 0, 30]},
@@ -16,21 +18,41 @@ Scene file (.json), paths relative to its folder; everything but `parts` and `sh
         {"shape": "ball", "size": 0.4, "position": [0.4, 1.5, 0], "texture": "clouds"},
         {"shape": "plane", "size": [3, 2], "position": [0, 3, 0], "rotation": [90, 0, 0], "texture": "poster.jpg"}
       ],
-      "camera": [0, 0, 0],        where it stands on average, metres; without it, where it sees all parts
-      "target": [0, 2, 0],        what it looks at; without it, the middle of all parts
-      "background": 0.0,          brightness where there is nothing
-      "light": [-0.4, -0.7, 0.6]  direction towards the light; null: surfaces are as bright as their texture
+      "camera": [0, 0, 0],
+      "target": [0, 2, 0],
+      "background": 0.0,
+      "light": [-0.4, -0.7, 0.6]
     }
-    shape       a box, a ball, a plane (z = 0 before it is turned, seen from above), or a mesh's file.
-    size        metres: a box along x, y, z [1, 1, 1]; a ball's diameter [1]; a plane along x, y [1, 1]; of a mesh the
-                longest side of its bounding box, without it the mesh is as large as it is.
-    position    of the origin of the part, for box, ball and plane their middle, metres [0, 0, 0].
-    rotation    degrees about the axes x, then y, then z of the world [0, 0, 0], about the origin of the part.
-    inward      whether its faces look inwards, as those of a room [false]; a camera may only be inside of such a part.
-    texture     plain, clouds, mosaic, bricks, lines, text, wood, roads, moon, page, or an image file, which is
-                stretched once over each side of the part, as page is (plain; a mesh: its own materials).
-    brightness  of the texture's darkest and brightest value ([0.15, 0.9]; of images, roads and moon [0, 1]).
-Surfaces are diffuse: brightness is the texture times 0.7 where the light does not fall and up to 1 where it does.
+
+Keys of the scene file; only `parts` is required:
+    parts       At least one part.
+    camera      Mean position of the camera, metres. Default: in front of the target and 30 degrees above it. With the
+                default target, the camera then sees all parts.
+    target      Point that the camera looks at, metres. Default: the middle of the bounding box of all parts.
+    background  Linear brightness of rays that hit no surface. Default: 0.
+    light       Direction towards the light. Default: [-0.4, -0.7, 0.6]. With null, every surface is as bright as its
+                texture.
+
+Keys of a part; only `shape` is required:
+    shape       box, ball, plane, or the path of a mesh file. Before its rotation, a plane lies in z = 0 and
+                its face looks upwards.
+    size        Metres: lengths of a box along x, y, z (default: [1, 1, 1]), diameter of a ball (default: 1), lengths of
+                a plane along x, y (default: [1, 1]), or longest side of the bounding box of a mesh (default: its length
+                in the mesh file).
+    position    Position of the origin of the part, metres. Default: [0, 0, 0]. The origin of a box, ball or plane is
+                its middle.
+    rotation    Degrees about the axes x, then y, then z of the world. Default: [0, 0, 0]. The part turns about its
+                origin.
+    inward      Whether the faces of the part look inwards, like the walls of a room. Default: false. A camera may be
+                inside of a closed part only if the faces of the part look inwards.
+    texture     plain, clouds, mosaic, bricks, lines, text, wood, roads, moon, page, or the path of an image file.
+                Default: plain, or the materials of a mesh file. An image file, like page, is stretched once over each
+                side of the part. The other textures repeat every 4 metres (moon: 6 metres).
+    brightness  Linear brightness of the darkest and the brightest value of the texture. Default: [0.15, 0.9], or [0, 1]
+                for image files, roads and moon.
+
+Surfaces are diffuse: their brightness is the texture times a factor between 0.7, where no light falls, and 1, where the
+light falls straight (see `scenes.diffuse_light`).
 """
 
 from __future__ import annotations
@@ -76,13 +98,13 @@ from enerf_ns.simulator.sources import linear_from_srgb, linear_picture
 from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 
 LARGEST_TEXTURE = 2048
-"""Most texels along one side of a texture made from a picture; less where there are more than eight pictures."""
+"""Most texels along one side of a texture from a picture. It is halved, once or more, for more than eight pictures."""
 
 SHAPES = {"box": 3, "ball": 1, "plane": 2}
-"""Shapes that need no file, with how many numbers their size has."""
+"""Count of numbers in the size of each shape that needs no file."""
 
 GREY = 0.8
-"""Brightness of a mesh that has neither a picture nor colours."""
+"""Linear brightness of a mesh that has neither a picture nor colours."""
 
 IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".tga", ".gif"}
 
@@ -90,23 +112,23 @@ Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Pose that turns the axes of glTF, whose y is up, to axes whose z is up."""
 
 GLTF_FLOAT, GLTF_FAN = 5126, 6
-"""Component type of floats and mode of a fan of triangles, as glTF numbers them."""
+"""Component type of floating point numbers, and mode of a fan of triangles, in glTF."""
 
 
 def load_scene(path: Path, rng: np.random.Generator, notes: list[str]) -> Scene:
-    """A scene from a mesh's file or from a scene file (.json), as the module describes them.
+    """The scene of a mesh file or of a scene file (.json); the docstring of this module describes both.
 
     Args:
-        path: of the file.
-        rng: draws the procedural textures of a scene file.
-        notes: gains a sentence for whatever was left out or is not as one may expect.
+        path: Mesh file or scene file.
+        rng: Generator that draws the procedural textures of a scene file.
+        notes: Gets a sentence for each thing that is left out or shown differently than a user may expect.
 
     Returns:
-        One channel where everything is grey, else three.
+        A scene of one channel where everything is grey, else of three.
 
     Raises:
-        RecordingError: The file or one that it names is missing or cannot be read, nothing in it has faces, a texture
-            is not known, or a value of the scene file is not what it must be.
+        RecordingError: The file, or a file that it names, is missing or cannot be read; the meshes have no faces, or
+            lie too far from the origin; or a key or value of the scene file is not allowed.
     """
     if path.suffix.lower() == ".json":
         return _read_scene_file(path, rng, notes)
@@ -115,22 +137,24 @@ def load_scene(path: Path, rng: np.random.Generator, notes: list[str]) -> Scene:
 
 @dataclass(frozen=True)
 class Piece:
-    """Triangles with one texture, before light falls on them."""
+    """Triangles with one texture, without light."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
     """Corners of the triangles in metres, counter-clockwise as seen from outside."""
     normals: Float[np.ndarray, "faces 3 3"]
-    """Unit vectors at the corners, outwards."""
+    """Unit normals at the corners, outwards."""
     uv: Float[np.ndarray, "faces 3 2"]
     """Texture coordinates of the corners, as in `Scene`."""
     colour: Float[np.ndarray, "faces 3 channels"]
-    """Linear colour at the corners; multiplies the image."""
+    """Linear colour at the corners, a factor of the image."""
     image: Float32[np.ndarray, "size size channels"] = field(default_factory=lambda: textures.plain()[..., None])
-    """Linear brightness of the texture, as in `Surface`."""
+    """Linear brightness of the texture; `size` is a power of two."""
 
     def moved(self, matrix: Float[np.ndarray, "4 4"]) -> Piece:
-        """The piece in other axes, which may be stretched or mirrored; corners stay counter-clockwise as seen from
-        outside."""
+        """The piece after an affine transform of its points.
+
+        The transform may stretch and mirror. Corners stay counter-clockwise as seen from outside.
+        """
         normals = self.normals @ np.linalg.pinv(matrix[:3, :3])
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
@@ -140,7 +164,7 @@ class Piece:
         return replace(self, triangles=triangles, normals=-normals).inside_out()
 
     def inside_out(self) -> Piece:
-        """The piece turned inside out: its inside becomes its outside."""
+        """The piece with faces that look the other way."""
         triangles, normals, uv, colour = (
             array[:, ::-1] for array in (self.triangles, -self.normals, self.uv, self.colour)
         )
@@ -148,10 +172,14 @@ class Piece:
 
 
 def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
-    """All triangles of a mesh's file, where its graph of nodes places them, z up.
+    """All triangles of a mesh file, where its scene graph places them, z up.
+
+    Args:
+        path: Mesh file.
+        notes: As for `load_scene`.
 
     Raises:
-        RecordingError: The file or one that it names is missing or cannot be read, or there are no faces.
+        RecordingError: The file, or a file that it names, is missing or cannot be read, or there are no faces.
     """
     if not path.is_file():
         raise RecordingError(
@@ -175,7 +203,7 @@ def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
         raise
     except ImportError as error:
         raise RecordingError(f"{path} needs a package that is not installed: {_in_one_line(error)}.") from error
-    except Exception as error:  # of any kind: each format of trimesh's has some of its own for what is damaged
+    except Exception as error:  # of any kind: trimesh raises other ones for damaged files of each format
         if not files.fault:
             raise RecordingError(
                 f"{path} cannot be read as a mesh ({_in_one_line(error)}); copy it in full or export it again."
@@ -199,7 +227,7 @@ def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Nothing is logged by trimesh, which shows tracebacks for what is said here in a sentence."""
+    """Silences trimesh, which logs tracebacks of faults that `read_mesh` reports in a sentence."""
     log = logging.getLogger("trimesh")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -212,20 +240,20 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _declared_faces(path: Path) -> int:
-    """How many polygons the header of a PLY file says there are; trimesh takes what it finds."""
+    """Number of polygons that the header of a PLY file states; trimesh does not compare it with what it finds."""
     with path.open("rb") as file:
         found = re.search(rb"^element\s+face\s+(\d+)", file.read(65536).split(b"end_header")[0], re.MULTILINE)
     return int(found[1]) if found else 0
 
 
 class _Files(FilePathResolver):
-    """Gives trimesh the files that a mesh names, and remembers what is wrong with one, which trimesh passes over."""
+    """Gives trimesh the files that a mesh names, and remembers faulty ones, which trimesh passes over."""
 
     def __init__(self, path: Path):
         super().__init__(str(path))
         self.folder = path.parent
         self.fault = ""
-        """The first file that is missing or no image, if any."""
+        """The first file that is missing or cannot be read as an image; empty if there is none."""
 
     def get(self, name: str) -> bytes:
         name = name.strip().replace("\\", "/")
@@ -241,13 +269,17 @@ class _Files(FilePathResolver):
     def _check_image(self, place: Path, content: bytes) -> None:
         try:
             Image.open(BytesIO(content)).load()
-        except Exception:  # of any kind, since Pillow has some of its own for what is damaged
+        except Exception:  # of any kind: Pillow raises other ones for damaged files of each format
             self.fault = self.fault or f"{place}, which cannot be read as an image"
             raise
 
 
 def _check_gltf(path: Path, notes: list[str]) -> int:
-    """Refuses what trimesh would read wrongly without a word, and says how many pictures the triangles have."""
+    """Refuses glTF files that trimesh reads wrongly without an error, and returns how many pictures the triangles have.
+
+    trimesh 5.2 takes the integers of quantised and sparse arrays for coordinates, ignores required extensions, and
+    leaves out pictures that it cannot decode.
+    """
     try:
         with path.open("rb") as file:
             start = file.read(20)
@@ -278,7 +310,7 @@ def _check_gltf(path: Path, notes: list[str]) -> int:
         raise RecordingError(f"{path} needs {', '.join(required)}, which cannot be read; export it uncompressed.")
     if coded:
         raise RecordingError(
-            f"{path} holds positions or texture coordinates that are sparse or no floating point numbers, which cannot "
+            f"{path} holds positions or texture coordinates that are sparse or not floating point, which cannot "
             "be read; export it without quantization."
         )
     if fans:
@@ -289,7 +321,7 @@ def _check_gltf(path: Path, notes: list[str]) -> int:
 
 
 def _is_read(extension: str) -> bool:
-    """Whether trimesh reads a glTF extension, or it changes nothing that matters here."""
+    """Whether trimesh reads a glTF extension, or the extension changes nothing that is simulated."""
     if extension == "KHR_draco_mesh_compression":
         return find_spec("DracoPy") is not None
     harmless = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_lights_punctual", "EXT_texture_webp")
@@ -297,7 +329,7 @@ def _is_read(extension: str) -> bool:
 
 
 def _pieces(path: Path, graph: trimesh.Scene, is_gltf: bool, expected: int, notes: list[str]) -> list[Piece]:
-    """The meshes of a graph, where it places them; notes say how those without a texture are coloured.
+    """The meshes of a scene graph, where it places them; a note for each substitute of a texture.
 
     Raises:
         RecordingError: There are fewer pictures than expected.
@@ -326,7 +358,16 @@ def _pieces(path: Path, graph: trimesh.Scene, is_gltf: bool, expected: int, note
 
 
 def _piece(mesh: trimesh.Trimesh, images: dict[int, np.ndarray], is_gltf: bool) -> tuple[Piece, str]:
-    """A mesh in its own axes, and what it shows instead of a texture; empty where it has all that it should."""
+    """A mesh in its own axes, and a description of the substitute that it shows for a texture that it lacks.
+
+    Args:
+        mesh: Mesh with at least one face.
+        images: Linear brightness of each picture, by the id of the picture.
+        is_gltf: Whether colours are linear, as in glTF, else sRGB.
+
+    Returns:
+        The piece, and the end of a sentence about the substitute, which is empty if the mesh lacks nothing.
+    """
     visual: Any = mesh.visual
     faces, instead = mesh.faces, "neither a texture nor colours and is shown in grey"
     colour: np.ndarray | None = None
@@ -371,7 +412,7 @@ def _pixels(picture: Image.Image) -> UInt8[np.ndarray, "height width channels"]:
 
 
 def _fractions(colours: ArrayLike | None) -> Float[np.ndarray, "*batch 3"]:
-    """Red, green and blue in [0, 1], of whole numbers or floats with or without a fourth channel; None is white."""
+    """Red, green and blue in [0, 1], from whole numbers or floats with or without a fourth channel; None is white."""
     if colours is None:
         return np.ones(3)
     values = np.asarray(colours)[..., :3]
@@ -386,14 +427,20 @@ def _one_or_three(colours: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "
 def linear_image(
     picture: Shaped[np.ndarray, "height width channels"], largest: int = LARGEST_TEXTURE
 ) -> Float32[np.ndarray, "size size channels"]:
-    """Linear brightness of an sRGB picture, uint8 or float32 in [0, 1], stretched to the next power of two above its
-    longer side, or to `largest`."""
+    """Linear brightness of an sRGB picture, stretched to a square.
+
+    The side of the square is the next power of two from the longer side of the picture on, but at most `largest`.
+
+    Args:
+        picture: sRGB, uint8 or float32 in [0, 1].
+        largest: Most texels along one side, a power of two.
+    """
     size = min(largest, 1 << (max(picture.shape[:2]) - 1).bit_length())
     return textures.square(linear_picture(_one_or_three(picture)), size)
 
 
 def _with_area(piece: Piece) -> Piece:
-    """The piece without triangles that are a line or a point, or whose numbers are not finite."""
+    """The piece without triangles that are a line or a point, or that have numbers that are not finite."""
     longest = np.linalg.norm(piece.triangles - np.roll(piece.triangles, 1, axis=1), axis=2).max(1)
     with np.errstate(invalid="ignore"):
         kept = (doubled_areas(piece.triangles) > 1e-7 * longest**2) & np.isfinite(piece.uv).all((1, 2))
@@ -402,16 +449,30 @@ def _with_area(piece: Piece) -> Piece:
 
 
 def _surface(piece: Piece, light: np.ndarray | None) -> Surface:
-    """What a piece looks like in a light, or without one as bright as its texture."""
+    """The surface of a piece in a light.
+
+    Args:
+        piece: Triangles without light.
+        light: Unit vector towards the light; None if every surface is as bright as its texture.
+    """
     lit = np.ones((1, 1, 1)) if light is None else diffuse_light(piece.normals, light)
     return Surface(piece.triangles, piece.uv, piece.colour * lit, piece.image)
 
 
 def _assemble(path: Path, surfaces: list[Surface], about: dict[str, Any]) -> Scene:
-    """The scene of a file; where it states no camera it stands 30 degrees above the middle and sees everything.
+    """The scene of some surfaces, with the camera and the background of a scene file.
+
+    By default the target is the middle of the surfaces. The camera stands 30 degrees above the target and sees all
+    surfaces.
 
     Args:
-        about: may state camera, target and background.
+        path: Mesh file or scene file, for errors.
+        surfaces: At least one.
+        about: Keys of the scene file; camera, target and background are used if they are there.
+
+    Raises:
+        RecordingError: The surfaces lie too far from the origin; camera, target or background is not allowed; or the
+            camera is too close to its target or right above or below it.
     """
     corners = np.concatenate([surface.triangles.reshape(-1, 3) for surface in surfaces])
     lower, upper = corners.min(0), corners.max(0)
@@ -419,7 +480,7 @@ def _assemble(path: Path, surfaces: list[Surface], about: dict[str, Any]) -> Sce
     if farthest * np.finfo(np.float32).eps > 1e-5 * size:
         raise RecordingError(
             f"{path} holds {size:.3g} m of surfaces {farthest:.3g} m away from the origin, too far for single "
-            "precision; move them closer to it, in a scene file by position."
+            "precision; move them closer to the origin (in a scene file: by position)."
         )
     where = str(path)
     target = _numbers(about, "target", 3, where, (lower + upper) / 2)
@@ -436,6 +497,7 @@ def _assemble(path: Path, surfaces: list[Surface], about: dict[str, Any]) -> Sce
 
 
 def _read_scene_file(path: Path, rng: np.random.Generator, notes: list[str]) -> Scene:
+    """The scene of a scene file; arguments and errors as for `load_scene`."""
     about = read_json(path)
     _check_keys(about, str(path), ("parts", "camera", "target", "background", "light"))
     parts = about.get("parts")
@@ -444,7 +506,7 @@ def _read_scene_file(path: Path, rng: np.random.Generator, notes: list[str]) -> 
     light = None if "light" in about and about["light"] is None else _numbers(about, "light", 3, str(path), LIGHT)
     if light is not None:
         if not light.any():
-            raise RecordingError(f"{path} holds light = [0, 0, 0], which is no direction; null is for no light.")
+            raise RecordingError(f"{path} holds light = [0, 0, 0], which is no direction; write null for no light.")
         light = light / np.linalg.norm(light)
     library = _Library(path.parent, rng)
     pieces = [
@@ -456,20 +518,32 @@ def _read_scene_file(path: Path, rng: np.random.Generator, notes: list[str]) -> 
 
 
 def _read_part(folder: Path, part: Any, where: str, library: _Library, notes: list[str]) -> list[Piece]:
+    """The pieces of one part of a scene file, at their place in the world.
+
+    Args:
+        folder: Folder of the scene file.
+        part: JSON value of the part.
+        where: Beginning of errors: scene file and number of the part.
+        library: Textures of the scene file.
+        notes: As for `load_scene`.
+
+    Raises:
+        RecordingError: A key or value of the part is not allowed, or a file that it names cannot be read.
+    """
     if not isinstance(part, dict):
         raise RecordingError(f"{where} is {_shown(part)}, but a JSON object was expected.")
     _check_keys(part, where, ("shape", "size", "position", "rotation", "inward", "texture", "brightness"))
     shape, texture = part.get("shape"), part.get("texture")
     if not isinstance(shape, str):
         raise RecordingError(
-            f"{where} holds shape = {_shown(shape)}, but box, ball, plane or a mesh's file was expected."
+            f"{where} holds shape = {_shown(shape)}, but box, ball, plane or a mesh file was expected."
         )
     if shape in SHAPES:
         size = _numbers(part, "size", SHAPES[shape], where, np.ones(SHAPES[shape]), lowest=1e-6)
         pieces, texture = [_shape(shape, size)], "plain" if texture is None else texture
     elif not Path(shape).suffix:
         raise RecordingError(
-            f"{where} holds shape = {_shown(shape)}, but box, ball, plane or a mesh's file was expected."
+            f"{where} holds shape = {_shown(shape)}, but box, ball, plane or a mesh file was expected."
         )
     else:
         pieces = read_mesh(folder / shape, notes)
@@ -486,7 +560,7 @@ def _read_part(folder: Path, part: Any, where: str, library: _Library, notes: li
     if texture is not None:
         pieces = _textured(pieces, *library.texture(texture, brightness, where))
     elif brightness is not None:
-        raise RecordingError(f"{where} holds brightness, but no texture that it is of; add one or leave it out.")
+        raise RecordingError(f"{where} holds brightness, but no texture; add texture or leave brightness out.")
     placed = np.eye(4)
     turn = _numbers(part, "rotation", 3, where, np.zeros(3))
     placed[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
@@ -495,7 +569,7 @@ def _read_part(folder: Path, part: Any, where: str, library: _Library, notes: li
 
 
 def _shape(shape: str, size: np.ndarray) -> Piece:
-    """A box, a ball or a plane about the origin."""
+    """A box, a ball or a plane whose middle is the origin; `size` as in a scene file, metres."""
     if shape == "box":
         mesh = trimesh.creation.box(size)
     elif shape == "ball":
@@ -509,17 +583,17 @@ def _shape(shape: str, size: np.ndarray) -> Piece:
 
 
 def _picture_of(file: Path) -> Shaped[np.ndarray, "height width channels"]:
-    """An image file as uint8, or as float32 in [0, 1] of more than 8 bits."""
+    """The image of a file: uint8, or float32 in [0, 1] if the file has more than 8 bits."""
     image = load_image(file)
     return image if image.dtype == np.uint8 else image / np.float32(find_white_level((file,)))
 
 
 class _Library:
-    """The textures of a scene file; each is made once.
+    """The textures of a scene file. Each texture is made once.
 
     Args:
-        folder: that images are in.
-        rng: draws the procedural ones.
+        folder: Folder of the scene file, to which paths of image files are relative.
+        rng: Generator that draws the procedural textures.
     """
 
     def __init__(self, folder: Path, rng: np.random.Generator):
@@ -531,9 +605,12 @@ class _Library:
         """The image [size, size, channels] of a texture, and its extent as in `textures.Procedural`.
 
         Args:
-            name: of a procedural texture or an image file.
-            brightness: of zeros and ones [2]; None is what is usual for the texture.
-            where: the part is, for the error.
+            name: Name of a procedural texture, or path of an image file.
+            brightness: Linear brightness of the levels 0 and 1 [2]; None for the default of the texture.
+            where: Beginning of errors: scene file and number of the part.
+
+        Raises:
+            RecordingError: The texture is not known, or the image file is missing or cannot be read.
         """
         if not isinstance(name, str) or (name not in textures.PROCEDURAL and not Path(name).suffix):
             raise RecordingError(
@@ -552,7 +629,13 @@ class _Library:
 
 
 def _textured(pieces: list[Piece], image: np.ndarray, extent: float | None) -> list[Piece]:
-    """Pieces with a texture instead of their own: along the sides of their bounding box."""
+    """The pieces with another texture, along the sides of their common bounding box.
+
+    Args:
+        pieces: At least one, in axes along which the texture lies.
+        image: Linear brightness of the texture [size, size, channels].
+        extent: Metres after which the texture repeats; None if it is stretched once over each side.
+    """
     corners = np.concatenate([piece.triangles.reshape(-1, 3) for piece in pieces])
     lower, span = corners.min(0), np.ptp(corners, axis=0)
     unit = np.where(span > 0, span, 1) if extent is None else extent
@@ -567,9 +650,10 @@ def _textured(pieces: list[Piece], image: np.ndarray, extent: float | None) -> l
 
 
 def _check_keys(about: dict[str, Any], where: str, known: tuple[str, ...]) -> None:
+    """Refuses keys that are not known."""
     unknown = [key for key in about if key not in known]
     if unknown:
-        raise RecordingError(f"{where} holds {_shown(unknown[0])}, which is not known; it may hold {', '.join(known)}.")
+        raise RecordingError(f"{where} holds {_shown(unknown[0])}, which is not known; use {', '.join(known)}.")
 
 
 def _numbers(
@@ -580,7 +664,19 @@ def _numbers(
     default: ArrayLike | None = None,
     lowest: float = -1e6,
 ) -> Float[np.ndarray, " count"]:
-    """So many numbers from `lowest` to a million, one of them without a list around it."""
+    """The numbers of a key of a scene file.
+
+    Args:
+        about: The scene file or a part of it.
+        key: Name of the value.
+        count: Count of numbers. A single number stands without a list around it.
+        where: Beginning of errors: scene file, and number of the part if there is one.
+        default: Value if the key is missing; if it is None, the key must be there.
+        lowest: Smallest number that is allowed; the largest is a million.
+
+    Raises:
+        RecordingError: The value is not `count` numbers in this range.
+    """
     if key not in about and default is not None:
         return np.atleast_1d(np.asarray(default, np.float64))
     value = about[key]
@@ -597,6 +693,7 @@ def _numbers(
 
 
 def _shown(value: Any) -> str:
+    """A value as JSON, cut after 80 characters."""
     text = json.dumps(value)
     return text if len(text) < 80 else f"{text[:80]} ..."
 

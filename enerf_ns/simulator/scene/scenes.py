@@ -1,6 +1,7 @@
-"""The scenes that `enerf simulate` knows: textured triangles, and where the camera stands on average.
+"""Scenes of textured triangles, and the built-in scenes of `enerf simulate`.
 
-World axes: x right, y away from the camera, z up, in metres. Every camera ray of a scene's motions hits a surface.
+World axes: x right, y away from the camera, z up, in metres. In the built-in scenes every camera ray hits a surface
+under every motion. A function that is added to `SCENES` becomes a scene of `engine.simulate`.
 """
 
 from __future__ import annotations
@@ -18,37 +19,36 @@ from enerf_ns.sensor.response import LUMA
 from enerf_ns.simulator.scene import textures
 
 LIGHT = np.array([-0.4, -0.7, 0.6]) / np.linalg.norm([-0.4, -0.7, 0.6])
-"""Direction towards the light, far away."""
+"""Unit vector towards the light, which is far away."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Diffuse triangles whose brightness does not depend on the direction they are seen from."""
+    """Diffuse triangles: their brightness does not depend on the viewing direction."""
 
     triangles: Float32[np.ndarray, "faces 3 3"]
     """Corners of the triangles in metres."""
     uv: Float32[np.ndarray, "faces 3 2"]
-    """Texture coordinates of the corners: to the right and downwards, 1 is once across the texture, which repeats."""
+    """Texture coordinates of the corners, to the right and downwards. The texture repeats after 1."""
     shade: Float32[np.ndarray, "faces 3 channels"]
-    """Light and colour at the corners, at least 0; brightness is shade times texture. One channel is grey, three are
-    linear red, green and blue."""
+    """Light and colour at the corners, at least 0. Brightness is shade times texture. One channel is grey, three
+    channels are linear red, green and blue."""
     texture: Int64[np.ndarray, " faces"]
     """Number of each face's texture."""
     texels: Float32[np.ndarray, "texels channels"]
-    """Linear brightness of the texels: the mip pyramids of all textures (see `textures.mip_pyramid`), one after the
-    other."""
+    """Linear brightness of the texels: the mip pyramids (see `textures.mip_pyramid`) of all textures in sequence."""
     texture_start: Int64[np.ndarray, " textures"]
     """First row of each texture in `texels`."""
     texture_size: Int64[np.ndarray, " textures"]
-    """Texels along one side of each texture's finest level, a power of two; 1 for a surface of one colour."""
+    """Texels along one side of the finest level of each texture, a power of two; 1 for a surface of one colour."""
     texels_per_metre: Float32[np.ndarray, " faces"]
-    """Texels per metre of the finest level on each face; 0 where the whole face has one texture coordinate."""
+    """Texels per metre of the finest level on each face; 0 if the whole face has one texture coordinate."""
     camera: Float64[np.ndarray, "3"]
-    """Where the camera stands on average, in metres."""
+    """Mean position of the camera, metres."""
     target: Float64[np.ndarray, "3"]
-    """What the camera looks at, in metres."""
+    """Point that the camera looks at, metres."""
     background: float = 0.0
-    """Brightness where a ray hits nothing."""
+    """Brightness of rays that hit no surface."""
 
     @property
     def channels(self) -> int:
@@ -56,10 +56,9 @@ class Scene:
         return self.texels.shape[1]
 
     def grey(self) -> Scene:
-        """The scene as a grey camera sees it: with the luma of its colours (see `response.luma`) instead of them.
+        """The scene with the luma (see `response.luma`) in place of each colour.
 
-        The luma of a product of two colours, of a texture's and a corner's, is taken to be the luma of the one times
-        the luma of the other.
+        The luma of a texture's colour times a corner's colour is approximated by the product of their lumas.
         """
         if self.channels == 1:
             return self
@@ -69,7 +68,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles with one texture; of its arrays some may be grey and others have three channels."""
+    """Triangles with one texture. Its `shade` and `image` may differ in their number of channels, one or three."""
 
     triangles: Float[np.ndarray, "faces 3 3"]
     """Corners of the triangles in metres."""
@@ -82,7 +81,14 @@ class Surface:
 
 
 def build_scene(surfaces: list[Surface], camera: ArrayLike, target: ArrayLike, background: float = 0.0) -> Scene:
-    """Puts surfaces together; images that are the same array are held once."""
+    """The scene of some surfaces. Surfaces whose image is the same array share one texture.
+
+    Args:
+        surfaces: At least one.
+        camera: Mean position of the camera [3], metres.
+        target: Point that the camera looks at [3], metres.
+        background: Brightness of rays that hit no surface.
+    """
     channels = max(array.shape[-1] for surface in surfaces for array in (surface.shade, surface.image))
     images = list({id(surface.image): surface.image for surface in surfaces}.values())
     number = {id(image): index for index, image in enumerate(images)}
@@ -108,13 +114,13 @@ def build_scene(surfaces: list[Surface], camera: ArrayLike, target: ArrayLike, b
 
 
 def doubled_areas(corners: np.ndarray) -> np.ndarray:
-    """Twice the areas of triangles [F, 3, D] in the plane or in space."""
+    """Twice the areas of triangles [F, 3, D] in the plane (D = 2) or in space (D = 3)."""
     edges = np.diff(corners.astype(np.float64), axis=1)
     return np.sqrt(np.maximum(np.linalg.det(edges @ edges.swapaxes(1, 2)), 0))
 
 
 def shapes(rng: np.random.Generator) -> Scene:
-    """A room with boxes and balls between 1.2 and 2.8 metres away; some of its surfaces have no texture."""
+    """A room with boxes and balls 1.2 to 2.8 metres away. Some surfaces have no texture."""
     clouds, fine, mosaic = textures.clouds(rng), textures.clouds(rng, 0.4, 0.05), textures.mosaic(rng)
     bricks, lines, text, plain = textures.bricks(rng), textures.lines(rng), textures.text(rng), textures.plain()
     back, floor = 3.3, -0.85
@@ -144,7 +150,7 @@ def carpet(rng: np.random.Generator) -> Scene:
 
 
 def roads(rng: np.random.Generator) -> Scene:
-    """A plane with the map of a town, in colour, seen as `carpet` is."""
+    """A plane with the map of a town, in colour, seen at a slant of 60 degrees from 1.5 metres away."""
     corners = 20 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     uv = triangles[..., :2] * (1, -1) / textures.EXTENT
@@ -155,7 +161,7 @@ def roads(rng: np.random.Generator) -> Scene:
 def moon(rng: np.random.Generator) -> Scene:
     """A grey landscape of craters under a low sun, seen at a slant of 53 degrees from 1.9 metres away.
 
-    Its mesh is finest, 4 centimetres, at the target and reaches 20 metres; light and shadows are in its texture.
+    Its mesh is finest at the target, 4 centimetres, and reaches 20 metres. Its texture holds light and shadows.
     """
     heights, brightness = textures.moon(rng)
     smooth = gaussian_filter(heights, 8, mode="wrap")
@@ -176,7 +182,7 @@ def moon(rng: np.random.Generator) -> Scene:
 
 
 def board(rng: np.random.Generator) -> Scene:
-    """A desk in a room, with a board 1.3 metres away on which text is printed in many sizes, some of it small."""
+    """A desk in a room, with a board 1.3 metres away. Text in many sizes, some of it small, is printed on the board."""
     bricks, wood, clouds, plain = textures.bricks(rng), textures.wood(rng), textures.clouds(rng), textures.plain()
     lines, text, mosaic = textures.lines(rng), textures.text(rng), textures.mosaic(rng)
     desk = -0.47
@@ -220,16 +226,17 @@ SCENES = {"shapes": shapes, "carpet": carpet, "roads": roads, "moon": moon, "boa
 def diffuse_light(
     normals: Float[np.ndarray, "faces 3 3"], light: Float[np.ndarray, "3"] = LIGHT
 ) -> Float[np.ndarray, "faces 3 1"]:
-    """What falls on corners with these unit normals: 0.7 from everywhere, and up to 0.3 from a light far away.
+    """The light on corners with these unit normals: 0.7 from everywhere, and up to 0.3 from a light far away.
 
     Args:
-        light: unit vector towards it.
+        normals: Unit normals at the corners.
+        light: Unit vector towards the light.
     """
     return 0.7 + 0.3 * np.maximum(normals @ light, 0)[..., None]
 
 
 def corner_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 3"]:
-    """Unit normals at the corners of all faces: of the smoothed surface, at edges above 40 degrees of the face."""
+    """Unit normals at the corners of all faces: smoothed over edges of up to 40 degrees, else normals of the face."""
     smooth, flat = mesh.vertex_normals[mesh.faces], mesh.face_normals[:, None]
     return np.where((smooth * flat).sum(-1, keepdims=True) > np.cos(np.radians(40)), smooth, flat)
 
@@ -237,8 +244,14 @@ def corner_normals(mesh: trimesh.Trimesh) -> Float[np.ndarray, "faces 3 3"]:
 def texture_coordinates(
     triangles: Float[np.ndarray, "faces 3 3"], face_normals: Float[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 3 2"]:
-    """Texture coordinates to the right and downwards, in the unit of the corners, along the two axes that a face lies
-    closest to: a texture is upright and not mirrored from outside."""
+    """Texture coordinates to the right and downwards along the two axes that each face lies closest to.
+
+    A texture is upright and not mirrored as seen from outside.
+
+    Args:
+        triangles: Corners, z up, in any unit; the texture coordinates have the same unit.
+        face_normals: Normals of the faces, outwards, of any length.
+    """
     across = np.abs(face_normals).argmax(1)
     faces = np.arange(len(across))
     outwards = np.sign(face_normals[faces, across]) * np.array([1, -1, 1])[across]
@@ -247,7 +260,13 @@ def texture_coordinates(
 
 
 def _surface(mesh: trimesh.Trimesh, levels: np.ndarray, brightness: tuple[float, float]) -> Surface:
-    """A mesh in a procedural texture [size, size] whose zeros and ones get the given brightness."""
+    """The surface of a mesh, lit, with a texture that repeats every `textures.EXTENT` metres.
+
+    Args:
+        mesh: In metres, z up.
+        levels: Texture in [0, 1] [size, size], as the functions of `textures` return them; `size` is a power of two.
+        brightness: Linear brightness of the levels 0 and 1.
+    """
     dark, bright = brightness
     uv = texture_coordinates(mesh.triangles, mesh.face_normals) / textures.EXTENT
     image = (dark + (bright - dark) * levels)[..., None]
@@ -257,7 +276,7 @@ def _surface(mesh: trimesh.Trimesh, levels: np.ndarray, brightness: tuple[float,
 def _room(
     lower: tuple, upper: tuple, back: np.ndarray, floor: np.ndarray, plain: np.ndarray, right: np.ndarray
 ) -> list[Surface]:
-    """The inner sides of a box between two corners, in textures."""
+    """The inner sides of a box between two corners, with textures."""
     room = trimesh.creation.box(bounds=[lower, upper])
     room.invert()
     room.unmerge_vertices()

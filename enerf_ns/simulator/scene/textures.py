@@ -1,4 +1,4 @@
-"""Procedural textures, made from a seed: square, grey or in colour, 0 where they are darkest and 1 where brightest."""
+"""Procedural textures, drawn by a generator: square, grey or R G B, with levels from 0 (darkest) to 1 (brightest)."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 SIZE = 1024
-"""Texels along one side of a texture, unless the texture's description says otherwise."""
+"""Texels along one side of a texture, unless its function states another size."""
 TEXELS_PER_METRE = 256
 EXTENT = SIZE / TEXELS_PER_METRE
-"""Metres that a texture of `SIZE` texels covers before it repeats."""
+"""Metres after which a texture of `SIZE` texels repeats."""
 
 Colour = Sequence[float]
 """Red, green and blue, each from 0 to 255."""
 
 
 def plain() -> np.ndarray:
-    """No texture at all."""
+    """A texture of one texel with level 1."""
     return np.ones((1, 1), np.float32)
 
 
@@ -67,7 +67,7 @@ def lines(rng: np.random.Generator, count: int = 30, background: float = 0.35) -
     for _ in range(count):
         ends = rng.integers(-SIZE // 4, SIZE + SIZE // 4, (2, 2))
         grey, width = float(rng.choice([0.0, 0.7, 1.0])), int(rng.integers(8, 32))
-        for shift in np.ndindex(3, 3):  # what leaves at one border comes in at the opposite one
+        for shift in np.ndindex(3, 3):  # strokes that leave at one border enter at the opposite one
             start, end = ends + SIZE * (np.array(shift) - 1)
             cv2.line(image, start.tolist(), end.tolist(), (grey,), width, cv2.LINE_AA)
     return image
@@ -84,8 +84,11 @@ def text(rng: np.random.Generator, line_height: float = 0.2, background: float =
 
 
 def roads(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048 3"]:
-    """A town on a map, in colour: streets of four widths with centre lines and crossings, blocks of houses and gardens,
-    parks, and a river with bridges."""
+    """The map of a town, in colour, which repeats after `EXTENT` metres.
+
+    It has streets of four widths with centre lines and crossings, blocks of houses and gardens, parks, and a river with
+    bridges.
+    """
     cells, steps = 6, 24
     town = _Map(np.empty((4096, 4096, 3), np.uint8))
     nodes = np.stack(np.meshgrid(*2 * [np.arange(cells) + 0.5], indexing="ij"), -1)
@@ -126,18 +129,18 @@ def roads(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048 3"]:
 
 @dataclass(frozen=True)
 class _Map:
-    """A picture of EXTENT by EXTENT metres to draw on; what leaves it at one border enters at the opposite one."""
+    """A canvas of EXTENT x EXTENT metres. Drawings that leave it at one border enter at the opposite border."""
 
     pixels: np.ndarray
-    """Texels of the picture, uint8 [size, size, 3]."""
+    """Texels of the canvas, uint8 [size, size, 3]."""
 
     def area(self, corners: np.ndarray, colour: Colour) -> None:
-        """Fills a polygon [N, 2]."""
+        """Fills a polygon with corners [N, 2], metres."""
         for points in self._copies(corners, 0):
             cv2.fillPoly(self.pixels, [points], colour)
 
     def stroke(self, points: np.ndarray, width: float, colour: Colour) -> None:
-        """A line along points [N, 2]."""
+        """Draws a line along points [N, 2]; points and width in metres."""
         for copy in self._copies(points, width):
             cv2.polylines(self.pixels, [copy], False, colour, max(self._texels(width), 1))
 
@@ -146,7 +149,7 @@ class _Map:
             cv2.circle(self.pixels, point.tolist(), self._texels(radius), colour, cv2.FILLED)
 
     def _copies(self, points: np.ndarray, width: float) -> Iterator[np.ndarray]:
-        """Whichever of the nine neighbours of what is drawn with a width (metres) touch the picture, in its texels."""
+        """Those of nine copies of a drawing, each shifted by EXTENT, that touch the canvas, in texels."""
         for shift in np.ndindex(3, 3):
             moved = points + EXTENT * (np.array(shift) - 1)
             if (moved.max(0) > -width).all() and (moved.min(0) < EXTENT + width).all():
@@ -157,7 +160,7 @@ class _Map:
 
 
 def _closed_curve(points: np.ndarray, period: tuple[float, float], steps: int) -> np.ndarray:
-    """A smooth line [N * steps + 1, 2] through points [N, 2], which begins again after the last, `period` further."""
+    """A smooth line [N * steps + 1, 2] through points [N, 2] that repeats after N points, shifted by `period`."""
     knots = np.arange(len(points) + 1)
     drift = np.outer(knots, period) / len(points)
     offsets = np.concatenate([points, points[:1]]) - drift
@@ -167,7 +170,7 @@ def _closed_curve(points: np.ndarray, period: tuple[float, float], steps: int) -
 
 
 def _inside(corners: np.ndarray, across: ArrayLike, down: ArrayLike) -> np.ndarray:
-    """Points [..., 2] of a block with corners [2 (down), 2 (across), 2], at shares of its width and of its height."""
+    """Points [..., 2] of a block with corners [2 (down), 2 (across), 2], at fractions of its width and height."""
     across, down = np.asarray(across)[..., None], np.asarray(down)[..., None]
     top, bottom = ((1 - across) * corners[row, 0] + across * corners[row, 1] for row in (0, 1))
     return (1 - down) * top + down * bottom
@@ -202,7 +205,7 @@ def _draw_tree(town: _Map, centre: np.ndarray, rng: np.random.Generator) -> None
 
 
 def _draw_houses(town: _Map, outline: np.ndarray, corners: np.ndarray, rng: np.random.Generator) -> None:
-    """Plots in rows, most with a house whose roof is darker on one side, the others with trees."""
+    """Draws rows of plots. Most have a house with a roof that is darker on one side; the others have trees."""
     town.area(outline, [(206, 192, 160), (176, 184, 140), (196, 196, 192)][rng.integers(3)])
     columns, rows = rng.integers(2, 6, 2)
     for column, row in np.ndindex(columns, rows):
@@ -227,7 +230,10 @@ def _draw_houses(town: _Map, outline: np.ndarray, corners: np.ndarray, rng: np.r
 
 
 def _draw_markings(town: _Map, line: np.ndarray, width: float, across: np.ndarray, steps: int) -> None:
-    """Centre and edge lines of a street, and zebra crossings before each street of width `across` that it meets."""
+    """Draws the centre line and the edge lines of a street, and zebra crossings before each street that it meets.
+
+    The widths of the streets that it meets are `across`, in metres.
+    """
     travelled = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
     along = np.linspace(0, travelled[-1], round(travelled[-1] / 0.004))
     points = np.stack([np.interp(along, travelled, line[:, axis]) for axis in (0, 1)], -1)
@@ -293,7 +299,7 @@ SENTENCES = (
 
 
 def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
-    """A printed page four thirds as wide as high: a title, the letters, columns of text in six sizes, an eye chart."""
+    """A printed page, to be shown 4 wide by 3 high: title, alphabet, columns of text in six sizes, and an eye chart."""
     fonts = Path(get_data_path()) / "fonts" / "ttf"
     width, height = 2732, 2049
     image = Image.new("L", (width, height), 255)
@@ -303,7 +309,7 @@ def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
         return ImageFont.truetype(str(fonts / f"{name}.ttf"), size)
 
     def paragraph(left: float, top: float, right: float, bottom: float, name: str, size: float) -> None:
-        """Sentences in any order, as many lines as there is room for."""
+        """Draws sentences in random order, as many lines as fit."""
         face, line, space = font(name, size), "", 1.3 * size
         words = " ".join(rng.permutation(np.tile(SENTENCES, 12))).split()
         for word in words:
@@ -340,16 +346,16 @@ def page(rng: np.random.Generator) -> Float32[np.ndarray, "2048 2048"]:
 
 
 MOON_EXTENT = 6.0
-"""Metres that the textures of `moon` cover before they repeat."""
+"""Metres after which the textures of `moon` repeat."""
 
 
 def moon(
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "2048 2048"], Float32[np.ndarray, "2048 2048"]]:
-    """Heights in metres, downwards in the picture being towards -y, and brightness of a landscape of craters.
+    """Heights in metres and brightness of a landscape of craters; downwards in both arrays is the direction -y.
 
-    The craters' number falls with the square of their radius; between them the ground is rough as a fractal, with
-    boulders. The sun stands 24 degrees above the horizon in the direction of -x; there are shadows.
+    The number of craters decreases with the square of their radius. Between them the ground is fractal, with boulders.
+    The sun stands 24 degrees above the horizon in the direction of -x and casts shadows.
     """
     size = 2048
     cell = MOON_EXTENT / size
@@ -359,13 +365,16 @@ def moon(
     heights = (0.03 * (rough - rough.mean()) / rough.std()).astype(np.float32)
 
     def around(centre: np.ndarray, radius: float, reach: float) -> tuple[tuple, np.ndarray]:
-        """Which texels lie within `reach` radii of a place, and how far away, in radii, of a ragged circle."""
+        """Indices of the texels within `reach` radii of a centre, and their distance from it in radii.
+
+        The outline of large circles is ragged.
+        """
         half = int(np.ceil(reach * radius / cell))
         offsets = np.arange(-half, half + 1)
         column, row = np.floor(centre / cell).astype(int)
         shift = offsets * cell / radius
         distance = np.hypot(shift, shift[:, None])
-        if half < 20:  # too small for its outline to be seen
+        if half < 20:  # its outline is too small to be visible
             return np.ix_((row + offsets) % size, (column + offsets) % size), distance
         angle = np.arctan2(shift[:, None], shift)
         waves, phases = rng.uniform(0, 0.06, 3), rng.uniform(0, 2 * np.pi, 3)
@@ -400,14 +409,14 @@ def moon(
 
 
 class Procedural(NamedTuple):
-    """How a texture is made by its name, and how it is put on a surface."""
+    """A texture that scene files know by name: its function, and how it lies on a surface."""
 
     make: Callable[[np.random.Generator], np.ndarray]
     """Function that draws the texture, float32 [size, size] or [size, size, 3]."""
     extent: float | None
-    """Metres that the texture covers before it repeats; None: it is stretched once over a side."""
+    """Metres after which the texture repeats; None if it is stretched once over each side of a part."""
     brightness: tuple[float, float]
-    """Brightness of the texture's zeros and ones where none is asked for."""
+    """Default linear brightness of the levels 0 and 1."""
 
 
 PROCEDURAL = {
@@ -422,23 +431,27 @@ PROCEDURAL = {
     "roads": Procedural(roads, EXTENT, (0, 1)),
     "moon": Procedural(lambda rng: moon(rng)[1], MOON_EXTENT, (0, 1)),
 }
+"""Textures by their names in scene files."""
 
 
 def square(image: Float[np.ndarray, "height width channels"], size: int) -> Float32[np.ndarray, "size size channels"]:
-    """An image of any size, stretched: area means where it shrinks, linear interpolation where it grows."""
+    """An image of any size, stretched to size x size.
+
+    Sides that shrink are averaged over areas; sides that grow are interpolated linearly.
+    """
     height, width, channels = image.shape
     small = cv2.resize(image.astype(np.float32), (min(width, size), min(height, size)), interpolation=cv2.INTER_AREA)
     return cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR).reshape(size, size, channels)
 
 
 def mip_pyramid(image: Float[np.ndarray, "size size channels"]) -> Float32[np.ndarray, "texels channels"]:
-    """All levels of a texture, finest first, each the mean of 2 x 2 texels of the one before, down to one texel.
+    """All levels of a texture, finest first. Each level holds the means of 2 x 2 texels of the level before.
 
     Args:
-        image: its size is a power of two.
+        image: Finest level; `size` is a power of two.
 
     Returns:
-        (4 * size**2 - 1) / 3 texels; the level of n x n texels starts at row 4 * (size**2 - n**2) / 3.
+        (4 * size**2 - 1) / 3 texels. The level of n x n texels starts at row 4 * (size**2 - n**2) / 3.
     """
     levels = [image.astype(np.float32)]
     while len(levels[-1]) > 1:
