@@ -186,6 +186,7 @@ def test_a_simulated_recording_is_sound(simulated: EventRecording):
     assert found.corners.focal_scale.value == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
 def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
@@ -201,6 +202,7 @@ def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
     assert "the times of the frames" in words(found)
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @READINGS
 def test_conventions_of_a_simulated_recording(
@@ -209,6 +211,7 @@ def test_conventions_of_a_simulated_recording(
     assert f"read as {named}: events are then" in words(agreement(fault(simulated)))
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.1, 0.3, 0.6, 0.8, 1.25, 1.7, 3.0])
 def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -217,6 +220,7 @@ def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor
     assert found.problems()[0].what.startswith("The focal length is wrong: ")
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.5])
 def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -245,6 +249,7 @@ def test_slider_depth_is_sound(slider: EventRecording):
     assert "focal length is not identifiable" in found.verdict()
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
 @pytest.mark.parametrize("fault", [faults.poses_late, faults.frames_late])
@@ -260,6 +265,7 @@ def test_clocks_of_slider_depth(
     assert words(found).startswith("The clocks disagree by ")
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "named"),
@@ -278,6 +284,7 @@ def test_conventions_of_slider_depth(
     assert named in found and "this motion" in found
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.1, 1.7])
 def test_focal_length_of_slider_depth_is_not_identifiable(slider: EventRecording, factor: float):
