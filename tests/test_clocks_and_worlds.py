@@ -107,7 +107,7 @@ def test_an_hour_and_a_millisecond(recording: Path, tmp_path: Path, slower: int,
     found, usual = Inspection.of(read_recording(folder)), Inspection.of(quick)
     length = whole.trajectory.end - whole.trajectory.start
     assert length == 10**8 * slower // faster and found.statistics.seconds == pytest.approx(length * 1e-9, rel=0.05)
-    for name in ("a pixel", "polarity", "path", "near and far", "box", "pose coverage"):
+    for name in ("per pixel", "polarity", "path", "near and far", "box", "pose coverage"):
         assert found.numbers()[name] == usual.numbers()[name]
     assert {problem.what for problem in found.problems} == {problem.what for problem in usual.problems}
 

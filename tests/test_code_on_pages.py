@@ -7,12 +7,9 @@ import contextlib
 import importlib.util
 import io
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -26,6 +23,7 @@ import pytest
 import tyro
 from recordings import write_davis
 from small_runs import SMALL
+from warm_commands import WarmCommands
 
 from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.registry import read_recording
@@ -375,24 +373,9 @@ def small(words: tuple[str, ...], number: int) -> list[str] | None:
     return [program, command, "--vis", "tensorboard", *flags, *rest]
 
 
-@pytest.fixture(scope="module")
-def forks() -> Iterator[subprocess.Popen[str]]:
-    """The program that forks a process for each command, in which all that it imports is there already."""
-    if not hasattr(os, "fork"):
-        pytest.skip("processes cannot be forked here")
-    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}
-    program = [sys.executable, str(Path(__file__).with_name("forked_commands.py"))]
-    with subprocess.Popen(
-        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **one_thread}
-    ) as process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FOLLOWED)
-def test_a_tutorial_can_be_followed(name: str, folder: Path, recording: Path, forks: subprocess.Popen[str]):
+def test_a_tutorial_can_be_followed(name: str, folder: Path, recording: Path, warm_commands: WarmCommands):
     """Its commands run one after another in one folder, each in a process of its own."""
     if name == "tutorial-davis.md":
         write_davis_of(recording, folder / "slider_depth")
@@ -407,7 +390,8 @@ def test_a_tutorial_can_be_followed(name: str, folder: Path, recording: Path, fo
             if not words or words[0] not in PROGRAMS or (command := small(words, trained)) is None:
                 continue
             trained += words[0] == "ns-train"
-            run(forks, command, folder)
+            code, printed = warm_commands.run(*command, cwd=folder, limit=120)
+            assert code == 0, f"{line}\n{printed[-3000:]}"
     assert list(folder.rglob("report.html")) or name == "tutorial-numpy.md"
 
 
@@ -429,19 +413,3 @@ def write_davis_of(recording: Path, target: Path) -> None:
         shutil.copy(file, target / "images" / f"frame_{number:08d}.png")
         listed.append(f"{time * 1e-9:.9f} images/frame_{number:08d}.png\n")
     (target / "images.txt").write_text("".join(listed))
-
-
-def run(forks: subprocess.Popen[str], command: list[str], folder: Path) -> None:
-    """Runs a command to its end.
-
-    Raises:
-        AssertionError: It fails; with what it printed.
-    """
-    printed = folder / "printed.txt"
-    printed.unlink(missing_ok=True)
-    asked = {"program": command[0], "arguments": command[1:], "folder": str(folder), "environment": dict(os.environ)}
-    assert forks.stdin is not None and forks.stdout is not None
-    forks.stdin.write(json.dumps({**asked, "output": str(printed), "limit": 120}) + "\n")
-    forks.stdin.flush()
-    code = int(forks.stdout.readline())
-    assert code == 0, f"{shlex.join(command)}\n{printed.read_text(errors='replace')[-3000:]}"

@@ -92,7 +92,7 @@ def test_what_is_left_out_is_counted_and_shown(folder: Path, gap, tmp_path: Path
         "them.",
     )
     (problem,) = [problem for problem in find_problems(recording) if "no poses for" in problem.what]
-    assert problem.what.endswith("what lies there is left out.") and "--time-range" in problem.advice
+    assert problem.what.endswith("events and frames there are left out.") and "--time-range" in problem.advice
 
     console = Console(record=True, width=200)
     Inspection.of(recording).print_tables(console)
@@ -106,7 +106,7 @@ def test_what_is_kept_is_said_to_be(folder: Path, tmp_path: Path):
     recording = read_recording(folder, keep_pose_gaps=True)
     assert not any("gap" in note for note in index_events(recording).notes)
     (problem,) = [problem for problem in find_problems(recording) if "no poses for" in problem.what]
-    assert problem.what.endswith("what lies there is used with guessed poses.")
+    assert problem.what.endswith("events and frames there are used with interpolated poses.")
     (row,) = [
         row for row in config_of(folder, tmp_path, True).resolved().pipeline.resolution.choices if "gaps" in row.part
     ]

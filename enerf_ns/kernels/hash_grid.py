@@ -108,8 +108,8 @@ def backend_of(name: str, x: Tensor, table: Tensor) -> str:
     Args:
         name: "torch", a name in `BACKENDS`, or "auto", which selects the first of `BACKENDS` that can compute, or else
             "torch".
-        x: Positions, shape (*batch, 3).
-        table: Rows, shape (levels * T, features).
+        x: Positions [..., 3].
+        table: Rows [levels * T, features].
 
     Raises:
         ValueError: No backend has this name, or the backend cannot compute for these tensors.

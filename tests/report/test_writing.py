@@ -151,7 +151,7 @@ def test_a_run_without_a_history_has_scores_pictures_and_a_flight(run: Run, tmp_
     assert rows_of(folder) == []
     page = page_of(folder)
     assert [source[:15] for source in page.sources] == ["data:image/png;", "data:video/mp4;"]
-    assert "after 2 steps" in (folder / "report.md").read_text()
+    assert "| 2 steps |" in (folder / "report.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -244,7 +244,7 @@ def test_a_bad_calibration_is_told(tmp_path: Path, evt2_file: Path):
     convert = Convert(evt2_file, tmp_path / "new", camera=camera)
     assert "camera.json lacks model, fx, fy, cx and cy; add it" in refused(tmp_path, convert)
     camera.write_text(json.dumps({**FILE_CAMERA, "model": "lookup"}))
-    assert 'camera.model = "lookup", but one of pinhole, radtan and fisheye' in refused(tmp_path, convert)
+    assert 'holds model = "lookup", but one of pinhole, radtan and fisheye' in refused(tmp_path, convert)
     convert = Convert(evt2_file, tmp_path / "new", poses=tmp_path / "poses.txt")
     assert "poses.txt is missing" in refused(tmp_path, convert)
 

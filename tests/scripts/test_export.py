@@ -116,7 +116,7 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     camera = json.loads((tmp_path / "poses.json").read_text())
     assert camera["fx"] == given.camera.fx
     assert [row["is_corrected"] for row in camera["corrections"]] == [True] + 5 * [False]
-    assert "What was refined of the poses" in (tmp_path / "inspect.html").read_text()
+    assert "Corrections of the poses" in (tmp_path / "inspect.html").read_text()
     seen, refined, stated = (
         one.eval_dataset.cameras.camera_to_worlds for one in (manager, loaded.datamanager, pipeline.datamanager)
     )

@@ -27,4 +27,4 @@ def test_the_help_says_for_which_format_an_option_is(capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit):
         parsed("--help")
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "For a recording of tum_vie: Which of the two event cameras" in shown and "Default: left." in shown
+    assert "For a recording of tum_vie: The event camera that is read" in shown and "Default: left." in shown

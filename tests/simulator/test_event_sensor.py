@@ -783,7 +783,10 @@ def test_responses_that_no_sensor_has_are_refused(wrong):
 
 
 def test_a_sensor_answers_no_gamma_encoded_brightness():
-    with pytest.raises(FlagError, match=r"^--response is gamma:2.2:0.1, but .* give logarithm:0.1, which .* it\.$"):
+    with pytest.raises(
+        FlagError,
+        match=r"^--response is gamma:2.2:0.1, but .* give logarithm:0.1, which .* brightness\.$",
+    ):
         SensorSettings(response="gamma:2.2:0.1")
 
 

@@ -141,7 +141,7 @@ def test_flags_are_made_from_the_options_of_all_formats(basket: Path, capsys: py
     with pytest.raises(SystemExit):
         tyro.cli(flags, args=["--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "For a recording of basket: Which of the baskets is read. None: red." in shown
+    assert "For a recording of basket: Which of the baskets is read. Default: red." in shown
     assert "For a recording of tum_vie: The event camera that is read" in shown
 
 
