@@ -78,12 +78,14 @@ CHOICES += [("model__event_loss", name) for name in EVENT_LOSSES]
 """Every value of every choice that the method has of its own."""
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_two_steps_of_every_configuration(recording: Path, tmp_path: Path, name: str):
     changes, losses = CONFIGURATIONS[name]
     check_two_steps(small_config(recording, tmp_path, **changes), losses)
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize(("name", "value"), CHOICES)
 def test_two_steps_with_every_choice(recording: Path, tmp_path: Path, name: str, value: str):
     """All losses but the frame loss where there is no frame, and but the interlevel loss without proposals."""

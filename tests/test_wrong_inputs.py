@@ -220,7 +220,7 @@ def output_of(command: str) -> tuple[str, str]:
     return ("--output", "page.html") if command == "inspect" else ("--output-dir", "new")
 
 
-@pytest.mark.sweep(150)
+@pytest.mark.sweep(100)
 @pytest.mark.parametrize("name", CASES)
 def test_a_wrong_input_is_refused_in_one_sentence(name, whole, refused, tmp_path, monkeypatch):
     wrong = CASES[name]

@@ -214,6 +214,7 @@ def test_auto_takes_what_is_compiled_for_the_device():
         assert fitting("auto", x.cuda(), table.cuda()) is import_module(BACKENDS["triton"].module).hash_grid
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("backend", list(BACKENDS))
 def test_backends_are_the_reference_whatever_the_size(backend, seed):

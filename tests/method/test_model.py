@@ -262,6 +262,7 @@ PICTURES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("backend", ["numba", "torch", "torch, 40 samples at once"])
 @pytest.mark.parametrize("setting", PICTURES)
 def test_a_picture_is_the_sum_over_all_samples(recording: Path, tmp_path: Path, setting: str, backend: str):

@@ -67,6 +67,7 @@ def plane_on_an_arc(folder: Path, gloss: float) -> Path:
     return folder
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("gloss", "expected"), [(0.0, False), (1.0, True)])
 def test_gloss_is_found_where_there_is_some(tmp_path: Path, gloss: float, expected: bool):

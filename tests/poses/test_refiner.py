@@ -326,8 +326,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> EventRecording:
     return read_recording(folder)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.0, pytest.param(1.0, marks=pytest.mark.exhaustive), 6.0])
+@pytest.mark.parametrize("delay", [0.0, 1.0, 6.0])
 def test_a_training_finds_the_clock(simulated: EventRecording, tmp_path: Path, delay: float):
     """Also where it is off by more than a field could learn with."""
     moving = simulated.trajectory

@@ -381,6 +381,7 @@ CHANGES = pytest.mark.parametrize(
 """What a field may come to show."""
 
 
+@pytest.mark.sweep(6)
 @CHANGES
 @pytest.mark.parametrize("every", [1, 2])
 def test_whatever_a_field_shows_the_report_is_whole_and_json(
@@ -408,6 +409,7 @@ def test_whatever_a_field_shows_the_report_is_whole_and_json(
     assert Image.open(tmp_path / "side-by-side.png").size[0] > 1000
 
 
+@pytest.mark.sweep(3)
 @CHANGES
 def test_the_end_of_a_run_is_told_by_its_history_as_by_its_checkpoint(
     recording: Path, tmp_path: Path, monkeypatch, output: str, change: Any

@@ -161,7 +161,7 @@ def contents(folder: Path) -> dict[Path, str]:
     return {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.rglob("*") if file.is_file()}
 
 
-@pytest.mark.sweep(3)
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_every_format_trains_as_it_is_unpacked(call, name: str, capsys: pytest.CaptureFixture[str]):
     data = RECORDINGS[name](Path("recording"))

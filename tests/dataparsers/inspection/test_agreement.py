@@ -202,7 +202,7 @@ def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
     assert "the times of the frames" in words(found)
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @READINGS
 def test_conventions_of_a_simulated_recording(
@@ -211,7 +211,7 @@ def test_conventions_of_a_simulated_recording(
     assert f"read as {named}: events are then" in words(agreement(fault(simulated)))
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.1, 0.3, 0.6, 0.8, 1.25, 1.7, 3.0])
 def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor: float):

@@ -280,6 +280,7 @@ MEASURE = """  document.getAnimations().forEach(animation => animation.pause());
   seen.chosen = shown(); seen.left = document.getAnimations().length;"""
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.skipif(BROWSER is None, reason="no chromium is installed")
 @pytest.mark.parametrize("width", [500, 1280])
 def test_a_browser_flicks_between_right_and_wrong_times(tmp_path: Path, width: int):
@@ -310,6 +311,7 @@ def test_slider_depth_has_no_problems(shared_data: Path):
     assert depths and 0.2 < float(depths[1]) < 0.45 and 2.07 < float(depths[2]) < 4.0
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["shapes", "carpet"])
 @pytest.mark.parametrize("motion", ["shake", "spiral"])

@@ -78,6 +78,7 @@ def test_smooth_brightness_shows_none_and_a_blind_sensor_its_period():
     assert found is not None and abs(found.value - 8e6) < 3 * found.error < 3e6
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("threshold", [0.01, 0.02])
 def test_a_period_is_told_of_brightness_that_takes_as_long_again_to_turn_back(threshold: float):
     """Turning back takes 1.3 and 1.6 times as long as going on, where it would take 12 and more without blindness."""
@@ -208,6 +209,7 @@ def test_events_of_one_polarity_tell_nothing(tmp_path: Path):
     assert (on.value, off.value, on.error, off.error, is_measured) == (0.25, 0.25, math.inf, math.inf, False)
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "noise"),

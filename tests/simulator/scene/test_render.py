@@ -751,7 +751,7 @@ def printed(process: subprocess.Popen[str]) -> str:
     return out.strip()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_processes_render_the_same_whatever_is_compiled_already(tmp_path):
     expected, fresh = printed(start(tmp_path)), str(tmp_path / "fresh")
     two_at_once = [start(tmp_path, NUMBA_CACHE_DIR=fresh) for _ in range(2)]

@@ -523,7 +523,7 @@ def test_the_same_seed_makes_the_same_scene(tmp_path):
     assert not same(load(path, 3)[0], load(path, 4)[0])
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_the_same_seed_makes_the_same_preset(name):
