@@ -8,10 +8,13 @@ import sys
 import sysconfig
 import venv
 import zipfile
-from importlib.metadata import distribution
+from importlib.metadata import distribution, distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 from enerf_ns.supervision.published_losses import PUBLISHED_LOSSES
 
@@ -99,6 +102,25 @@ def test_every_module_of_the_plugin_can_be_imported_first(part: int):
     assert failed.strip() == ""
 
 
+def test_constraints_hold_on_the_first_release_of_each_python():
+    """A version that wants Python 3.11.5 cannot be installed on the 3.11.2 of a distribution."""
+    wanted = {canonicalize_name(found.metadata["Name"]): found for found in distributions()}
+    unusable = []
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        if line.startswith("#"):
+            continue
+        constraint = Requirement(line)
+        found = wanted.get(canonicalize_name(constraint.name))
+        if found is None or not constraint.specifier.contains(found.version):
+            continue
+        pythons = SpecifierSet(found.metadata["Requires-Python"] or "")
+        for python in ("3.10.0", "3.11.0", "3.12.0"):
+            environment = {"python_version": python.removesuffix(".0"), "python_full_version": python}
+            if (constraint.marker is None or constraint.marker.evaluate(environment)) and python not in pythons:
+                unusable.append(f"{line} on {python}")
+    assert unusable == []
+
+
 def test_entry_points_are_specifications():
     assert {point.name for point in ENTRY_POINTS} >= {
         "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
@@ -160,7 +182,7 @@ def test_wheel_in_a_fresh_environment(wheel: Path, tmp_path: Path):
 
     code = f"""
 import importlib
-from importlib.metadata import distribution
+from importlib.metadata import distribution, distributions
 for module in {MODULES}:
     print("file", importlib.import_module(module).__file__)
 for point in distribution("enerf-ns").entry_points:
