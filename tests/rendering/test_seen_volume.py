@@ -15,6 +15,7 @@ from small_runs import set_up, small_config
 
 from enerf_ns.method.model import BoxCollider
 from enerf_ns.rendering.seen_volume import (
+    FEW_EVENTS,
     STEPS_A_VOXEL,
     SeenVolume,
     grid_shape,
@@ -137,3 +138,13 @@ def test_voxels_are_about_cubes_and_what_is_no_number_lies_in_none():
         aabb, grid_shape(aabb), torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0, 0, 0]])
     )
     assert inside.tolist() == [False, False, True]
+
+
+def test_evidence_is_half_at_few_events_and_grows_with_their_number():
+    aabb = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    numbers = torch.tensor([0.0, FEW_EVENTS * 50.0, 50.0, 5000.0])
+    volume = SeenVolume(aabb, torch.ones(4, 1, 1, dtype=torch.bool), numbers.reshape(4, 1, 1), 50.0)
+    centres = torch.tensor([[0.125 + 0.25 * voxel, 0.5, 0.5] for voxel in range(4)])
+    evidence = volume.evidence(centres).tolist()
+    assert evidence[:2] == pytest.approx([0.0, 0.5])
+    assert 0.95 < evidence[2] < evidence[3] < 1.0
