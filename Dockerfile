@@ -4,10 +4,7 @@
 #     docker run --rm -v "$PWD:/data" enerf-ns enerf demo --output-dir demo
 #     docker run --rm --gpus all -p 7007:7007 -v "$PWD:/data" enerf-ns ns-train enerf --data recording
 #
-# The PyTorch of the default image has CUDA and also runs on a CPU. TORCH_INDEX names an index of other wheels of PyTorch,
-# such as the one for CPUs that pytorch.org names; the image is then several gigabytes smaller:
-#
-#     docker build -t enerf-ns:cpu --build-arg TORCH_INDEX=ADDRESS .
+# Its PyTorch has CUDA, and also runs on a CPU.
 FROM python:3.11-slim-bookworm
 
 # Two packages below Nerfstudio are compiled; Open3D, which ns-export imports, needs the libraries.
@@ -16,13 +13,9 @@ RUN apt-get update \
         build-essential git libusb-1.0-0 libgl1 libx11-6 libgomp1 libegl1 \
     && rm -rf /var/lib/apt/lists/*
 
-ARG TORCH_INDEX=
 ENV PIP_NO_CACHE_DIR=1 PIP_CONSTRAINT=/opt/enerf-ns/constraints.txt
 WORKDIR /opt/enerf-ns
-COPY constraints.txt ./
-RUN if [ -n "$TORCH_INDEX" ]; then pip install --index-url "$TORCH_INDEX" torch torchvision; fi
-
-COPY pyproject.toml README.md LICENSE ./
+COPY constraints.txt pyproject.toml README.md LICENSE ./
 COPY enerf_ns enerf_ns
 COPY dataparsers dataparsers
 # Nerfstudio brings opencv-python-headless, which owns the same folder cv2/: the package with more in it comes last.
