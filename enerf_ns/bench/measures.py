@@ -128,14 +128,14 @@ def _sensor(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     sensor, recording = run.pipeline.model.sensor, run.config.data
     assert recording is not None
     simulated = SensorSettings(**json.loads((recording / TRUTH).read_text())["sensor"])
-    on, off = (float(torch.as_tensor(threshold).mean()) for threshold in sensor.contrast_thresholds)
+    on, off = (torch.as_tensor(threshold).mean().item() for threshold in sensor.contrast_thresholds)
     found = {
         "contrast_threshold_on": on,
         "contrast_threshold_off": off,
         "threshold_ratio": on / off,
-        "refractory_ms": 1e-6 * float(sensor.refractory_period),
+        "refractory_ms": 1e-6 * torch.as_tensor(sensor.refractory_period).item(),
     }
-    found |= {"leak_rate": float(sensor.leak_rate), "cutoff_frequency": sensor.cutoff_frequency}
+    found |= {"leak_rate": torch.as_tensor(sensor.leak_rate).item(), "cutoff_frequency": sensor.cutoff_frequency}
     true_on, true_off = simulated.contrast_thresholds
     truth = {
         "contrast_threshold_on": true_on,

@@ -152,7 +152,7 @@ def expected_brightness_scale(contrast_thresholds: tuple[float, float], sensor: 
         sensor: Model of the sensor with which the field learnt.
     """
     encoding = sensor.response.exponent if isinstance(sensor.response, Gamma) else 1.0
-    return encoding * 0.5 * sum(contrast_thresholds) / float(sensor.mean_threshold)
+    return encoding * 0.5 * sum(contrast_thresholds) / torch.as_tensor(sensor.mean_threshold).item()
 
 
 def _rays(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> RayBundle:

@@ -267,7 +267,7 @@ class EnerfPipeline(VanillaPipeline):
         rays = manager.event_rays(some, sensor)
         times = manager.event_times(some, sensor)
         camera = manager.event_camera
-        unit = float(sensor.mean_threshold)
+        unit = torch.as_tensor(sensor.mean_threshold).item()
         with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training must draw as without this
             rgb, slopes = render_slopes(
                 model,
@@ -363,7 +363,7 @@ class EnerfPipeline(VanillaPipeline):
         self.train()
         change = brightness_change(start, end, batch, sensor)
         measured = sensor.measured_change(batch)
-        return event_scores(change, measured, float(sensor.mean_threshold))
+        return event_scores(change, measured, torch.as_tensor(sensor.mean_threshold).item())
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

@@ -119,9 +119,9 @@ class Lag(Thresholds):
         Returns:
             A sentence for the user; None if nothing was left out.
         """
-        if not (self.learns_lag and self.least_delay) or float(self.delay) >= self.least_delay:
+        if not (self.learns_lag and self.least_delay) or torch.as_tensor(self.delay).item() >= self.least_delay:
             return None
-        found = max(float(self.delay), 0.0)
+        found = max(torch.as_tensor(self.delay).item(), 0.0)
         torch.as_tensor(self.delay).zero_()
         self._has_lag = False
         return (
@@ -132,12 +132,12 @@ class Lag(Thresholds):
     def _resume(self, _: object) -> None:
         """Finds out of a checkpoint whether the lag was left out: a delay is then exactly 0, and a learned one never
         is."""
-        self._has_lag = float(self.delay) != 0.0
+        self._has_lag = torch.as_tensor(self.delay).item() != 0.0
 
     @property
     def cutoff_frequency(self) -> float:
         """Cut-off frequency (Hz) of the photoreceptor at brightness 1; infinite for pixels that do not lag."""
-        delay = float(self.delay)
+        delay = torch.as_tensor(self.delay).item()
         return 1e3 / (2.0 * math.pi * delay) if delay > 0.0 else math.inf
 
     def lag(
@@ -185,7 +185,7 @@ class Lag(Thresholds):
     def learned(self) -> dict[str, float]:
         """Values of the sensor that were learned: with `cutoff_frequency`, Hz."""
         found = super().learned()
-        if isinstance(self.delay, Tensor) and float(self.delay) > 0.0:
+        if isinstance(self.delay, Tensor) and self.delay.item() > 0.0:
             found["cutoff_frequency"] = self.cutoff_frequency
         return found
 

@@ -82,7 +82,7 @@ class Leak(Thresholds, RefractoryPeriod):
         """Values of the sensor that were learned: with `leak_rate`, on events a second."""
         found = super().learned()
         if isinstance(self.leak_rate, Tensor):
-            found["leak_rate"] = float(self.leak_rate)
+            found["leak_rate"] = self.leak_rate.item()
         return found
 
 

@@ -75,7 +75,7 @@ class RefractoryPeriod(SensorPart):
         """Values of the sensor that were learned: with `refractory_period_ms`, milliseconds."""
         found = super().learned()
         if self.log_refractory_period is not None:
-            found["refractory_period_ms"] = 1e-6 * float(self.log_refractory_period.exp())
+            found["refractory_period_ms"] = 1e-6 * self.log_refractory_period.exp().item()
         return found
 
 

@@ -219,7 +219,7 @@ def _brightness_changes(run: Run) -> list[PartError]:
             metadata={name: value.double() for name, value in rays.metadata.items()},
         )
         double = changes(copy.deepcopy(model).double(), wide)
-    threshold = float(sensor.mean_threshold)
+    threshold = torch.as_tensor(sensor.mean_threshold).item()
     return [
         PartError("change of log brightness in float32", "float64", _rms((single - double) / threshold), "thresholds"),
         PartError(
