@@ -14,6 +14,7 @@ from warm_commands import WarmCommands
 # without a GPU, kernels of Triton run as NumPy; Triton reads this when it is imported
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
+torch.set_warn_always(True)  # else a warning of PyTorch is raised at its first place alone, and filters miss the others
 
 SWEEP_SEED = "ENERF_SWEEP_SEED"
 
