@@ -55,15 +55,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def not_drawn(items: list[pytest.Item], seed: int) -> set[pytest.Item]:
-    """Returns the cases of sweeps that are not run: all but as many as the marker of each test says."""
+    """Returns the cases of sweeps that are not run: all but as many as the marker of each test says, besides those that
+    are marked exhaustive. Tests whose marker has the same name are one sweep."""
     sweeps: dict[tuple[str, int], list[pytest.Item]] = defaultdict(list)
     for item in items:
-        if marker := item.get_closest_marker("sweep"):
-            sweeps[item.nodeid.partition("[")[0], marker.args[0]].append(item)
+        if (marker := item.get_closest_marker("sweep")) and "exhaustive" not in item.keywords:
+            number, name = (*marker.args, item.nodeid.partition("[")[0])[:2]
+            sweeps[name, number].append(item)
     return {
         item
-        for (test, number), cases in sweeps.items()
-        for item in random.Random(f"{seed} {test}").sample(cases, max(len(cases) - number, 0))
+        for (name, number), cases in sweeps.items()
+        for item in random.Random(f"{seed} {name}").sample(cases, max(len(cases) - number, 0))
     }
 
 

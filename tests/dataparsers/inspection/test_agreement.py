@@ -115,6 +115,10 @@ def test_a_calibration_that_is_of_another_lens_is_named(lens: Camera):
     assert 200 * found.focal_scale.value == pytest.approx(lens.fx, rel=0.12)  # some of it is distortion
 
 
+SIMULATED_FAULTS = pytest.mark.sweep(2, "faults of a simulated recording")
+SLIDER_FAULTS = pytest.mark.sweep(1, "faults of slider_depth")
+"""Of all faults together, some are drawn: each takes seconds."""
+
 READINGS = pytest.mark.parametrize(
     ("fault", "named"),
     [
@@ -186,10 +190,10 @@ def test_a_simulated_recording_is_sound(simulated: EventRecording):
     assert found.corners.focal_scale.value == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
-def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
+def test_the_clock_of_the_poses_of_a_simulated_recording(simulated: EventRecording, late: int):
     found = agreement(faults.poses_late(simulated, late))
     assert found.pose_delay.value == pytest.approx(late, abs=0.5)
     assert f"the poses are stamped {abs(found.pose_delay.value):.1f} ms {'late' if late > 0 else 'early'}" in words(
@@ -197,12 +201,17 @@ def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
     )
     assert "to the times of the poses" in words(found) or "off the times of the poses" in words(found)
 
+
+@SIMULATED_FAULTS
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [10, -10])
+def test_the_clock_of_the_frames_of_a_simulated_recording(simulated: EventRecording, late: int):
     found = agreement(faults.frames_late(simulated, late))
     assert found.frame_delay is not None and found.frame_delay.value == pytest.approx(late, abs=1.0)
     assert "the times of the frames" in words(found)
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @READINGS
 def test_conventions_of_a_simulated_recording(
@@ -211,7 +220,7 @@ def test_conventions_of_a_simulated_recording(
     assert f"read as {named}: events are then" in words(agreement(fault(simulated)))
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.1, 0.3, 0.6, 0.8, 1.25, 1.7, 3.0])
 def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -220,7 +229,7 @@ def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor
     assert found.problems()[0].what.startswith("The focal length is wrong: ")
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.5])
 def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -239,25 +248,30 @@ def slider(shared_data: Path) -> EventRecording:
     return read_recording(shared_data / "slider_depth")
 
 
+@pytest.fixture(scope="module")
+def sound_slider(slider: EventRecording) -> Agreement:
+    return agreement(slider)
+
+
 @pytest.mark.slow
-def test_slider_depth_is_sound(slider: EventRecording):
+def test_slider_depth_is_sound(sound_slider: Agreement):
     """Its events are some milliseconds later than its frames and, by its turning point, than its poses."""
-    found = agreement(slider)
+    found = sound_slider
     assert found.problems() == []
     assert found.frame_delay is not None and found.pose_delay.is_identifiable and found.frame_delay.is_identifiable
     assert found.pose_delay.value == pytest.approx(found.frame_delay.value, abs=3.0)
     assert "focal length is not identifiable" in found.verdict()
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
 @pytest.mark.parametrize("fault", [faults.poses_late, faults.frames_late])
 def test_clocks_of_slider_depth(
-    slider: EventRecording, fault: Callable[[EventRecording, int], EventRecording], late: int
+    slider: EventRecording, sound_slider: Agreement, fault: Callable[[EventRecording, int], EventRecording], late: int
 ):
     """The clock of its poses is identifiable because the slider turns back at its end."""
-    sound, found = agreement(slider), agreement(fault(slider, late))
+    sound, found = sound_slider, agreement(fault(slider, late))
     assert sound.frame_delay and found.frame_delay
     moved = found.pose_delay.value - sound.pose_delay.value, found.frame_delay.value - sound.frame_delay.value
     expected = (late, 0) if fault is faults.poses_late else (0, late)
@@ -265,7 +279,7 @@ def test_clocks_of_slider_depth(
     assert words(found).startswith("The clocks disagree by ")
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "named"),
@@ -284,7 +298,7 @@ def test_conventions_of_slider_depth(
     assert named in found and "this motion" in found
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.1, 1.7])
 def test_focal_length_of_slider_depth_is_not_identifiable(slider: EventRecording, factor: float):
