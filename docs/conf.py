@@ -40,12 +40,14 @@ def write_commands(app: Any) -> None:
     programs = {f"enerf {name}": cli.entrypoint for name in cli.COMMANDS} | {"ns-train enerf": train.entrypoint}
     texts = []
     for program, entrypoint in programs.items():  # in this process, since starting each would take seconds of imports
-        printed, environment = io.BytesIO(), {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
+        printed = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
+        environment = {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
         with patch.dict(os.environ, environment), patch.object(sys, "argv", [*program.split(), "--help"]):
-            with redirect_stdout(io.TextIOWrapper(printed, "utf-8", write_through=True)), suppress(SystemExit):
+            with redirect_stdout(printed), suppress(SystemExit):
                 entrypoint()
-        assert printed.getvalue(), f"{program} --help prints nothing"
-        texts.append(printed.getvalue().decode())
+        printed.seek(0)
+        texts.append(printed.read())
+        assert texts[-1], f"{program} --help prints nothing"
     sections = [f"## {name}\n\n```text\n{text.strip()}\n```" for name, text in zip(programs, texts, strict=True)]
     head = (
         "# Commands and flags\n\nThe output of `--help` of each command. [Training](training.md) lists the flags of "
