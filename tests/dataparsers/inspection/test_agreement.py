@@ -17,6 +17,7 @@ from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaki
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import agreement as agreement_module
 from enerf_ns.dataparsers.inspection.agreement import Agreement
+from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
@@ -243,21 +244,16 @@ def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRec
     assert "reprojection error of corners" in found.rows()["focal length by frames"]
 
 
-@pytest.fixture(scope="module")
-def slider(shared_data: Path) -> EventRecording:
-    return read_recording(shared_data / "slider_depth")
-
-
-@pytest.fixture(scope="module")
-def sound_slider(slider: EventRecording) -> Agreement:
-    return agreement(slider)
+@pytest.fixture
+def slider(slider_depth: Inspection) -> EventRecording:
+    return slider_depth.recording
 
 
 @pytest.mark.slow
-def test_slider_depth_is_sound(sound_slider: Agreement):
+def test_slider_depth_is_sound(slider_depth: Inspection):
     """Its events are some milliseconds later than its frames and, by its turning point, than its poses."""
-    found = sound_slider
-    assert found.problems() == []
+    found = slider_depth.agreement
+    assert found is not None and found.problems() == []
     assert found.frame_delay is not None and found.pose_delay.is_identifiable and found.frame_delay.is_identifiable
     assert found.pose_delay.value == pytest.approx(found.frame_delay.value, abs=3.0)
     assert "focal length is not identifiable" in found.verdict()
@@ -268,11 +264,11 @@ def test_slider_depth_is_sound(sound_slider: Agreement):
 @pytest.mark.parametrize("late", [10, -10])
 @pytest.mark.parametrize("fault", [faults.poses_late, faults.frames_late])
 def test_clocks_of_slider_depth(
-    slider: EventRecording, sound_slider: Agreement, fault: Callable[[EventRecording, int], EventRecording], late: int
+    slider_depth: Inspection, fault: Callable[[EventRecording, int], EventRecording], late: int
 ):
     """The clock of its poses is identifiable because the slider turns back at its end."""
-    sound, found = sound_slider, agreement(fault(slider, late))
-    assert sound.frame_delay and found.frame_delay
+    sound, found = slider_depth.agreement, agreement(fault(slider_depth.recording, late))
+    assert sound and sound.frame_delay and found.frame_delay
     moved = found.pose_delay.value - sound.pose_delay.value, found.frame_delay.value - sound.frame_delay.value
     expected = (late, 0) if fault is faults.poses_late else (0, late)
     assert moved == pytest.approx(expected, abs=2.0)
