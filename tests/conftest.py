@@ -60,8 +60,8 @@ def not_drawn(items: list[pytest.Item], seed: int) -> set[pytest.Item]:
     sweeps: dict[tuple[str, int], list[pytest.Item]] = defaultdict(list)
     for item in items:
         if (marker := item.get_closest_marker("sweep")) and "exhaustive" not in item.keywords:
-            name = marker.args[1] if len(marker.args) > 1 else item.nodeid.partition("[")[0]
-            sweeps[name, marker.args[0]].append(item)
+            number, name = marker.args[0], (*marker.args, item.nodeid.partition("[")[0])[1]
+            sweeps[name, number].append(item)
     return {
         item
         for (name, number), cases in sweeps.items()
