@@ -101,7 +101,7 @@ def test_an_error_comes_alone(
     assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("tool", ["ns-train", "ns-eval", "ns-render", "ns-viewer", "ns-export", "enerf"])
 def test_no_tool_begins_with_a_warning(tool: str, tmp_path: Path):
     run = subprocess.run([ns(tool), "--help"], cwd=tmp_path, capture_output=True, text=True, timeout=300)

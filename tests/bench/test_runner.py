@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import torch
 from small_runs import SMALL_BENCH
 from warm_commands import WarmCommands
 
-from enerf_ns.bench import runner
+from enerf_ns.bench import measures, runner
 from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
 from enerf_ns.bench.measures import MEASURES, TRUTH, evaluate, milliseconds_a_step
 from enerf_ns.bench.runner import Bench, parse_budget, steps_of
@@ -263,6 +264,29 @@ def test_measures_of_a_run(finished: Path):
     assert found["megabytes_a_step"] > 4 * parameters / 1e6
     parts = [found[name] for name in ("sample", "poses", "rays", "images", "forward_and_backward")]
     assert sum(parts) == pytest.approx(100.0) and found["images"] == 0.0 and min(parts[:3]) > 0.0
+
+
+def test_a_part_of_a_step_takes_the_median_of_its_calls_in_milliseconds(monkeypatch: pytest.MonkeyPatch):
+    """With a clock that each call moves on; the first call, which warms up, does not count."""
+    seconds = [7.0, *4 * [0.001], 0.0025, *4 * [0.9]]
+    now = 0.0
+
+    def call() -> None:
+        nonlocal now
+        now += seconds.pop(0)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    run: Any = SimpleNamespace(pipeline=SimpleNamespace(device="cpu"))
+    assert measures._milliseconds(call, run) == pytest.approx(2.5) and not seconds
+
+
+def test_megabytes_of_a_step_are_what_is_kept_and_four_numbers_of_each_parameter(monkeypatch: pytest.MonkeyPatch):
+    """The parameter, its gradient and two moments of Adam, of four bytes each."""
+    monkeypatch.setattr(measures, "kept_bytes", lambda *_: 3_000_000)
+    pipeline = torch.nn.Module()
+    pipeline.model = torch.nn.Linear(999, 250)
+    run: Any = SimpleNamespace(pipeline=pipeline)
+    assert MEASURES["memory"](run, [])["megabytes_a_step"] == pytest.approx(3.0 + 16 * 250_000 / 1e6)
 
 
 @pytest.fixture(scope="session")

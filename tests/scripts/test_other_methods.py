@@ -15,7 +15,8 @@ import torchvision
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
-from test_tools import RECORDINGS, call, check_video, contents, start  # noqa: F401 - call is a fixture
+from test_tools import RECORDINGS, call, check_video, contents  # noqa: F401 - call is a fixture
+from warm_commands import WarmCommands
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
@@ -167,10 +168,10 @@ def test_views_for_evaluation_alone_are_nothing_to_train_on(tmp_path: Path):
         config.setup().get_dataparser_outputs("train")
 
 
-def test_without_frames_a_sentence_says_what_to_do(recording: Path, tmp_path: Path):
+def test_without_frames_a_sentence_says_what_to_do(recording: Path, tmp_path: Path, warm_commands: WarmCommands):
     shutil.copytree(recording, tmp_path / "events", ignore=shutil.ignore_patterns("images*", "depth"))
-    trained = start("ns-train", "nerfacto", *STEPS, "event-data", "--data", "events", cwd=tmp_path)
-    assert trained.returncode != 0 and "Traceback" not in trained.stderr
-    said = " ".join(trained.stderr.split())
+    code, printed = warm_commands.run("ns-train", "nerfacto", *STEPS, "event-data", "--data", "events", cwd=tmp_path)
+    assert code != 0 and "Traceback" not in printed
+    said = " ".join(printed.split())
     assert "events holds no frames to train on" in said and "ns-train enerf --data" in said
     assert not (tmp_path / "outputs").is_dir() or not list((tmp_path / "outputs").rglob("*.ckpt"))
