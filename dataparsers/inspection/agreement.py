@@ -341,11 +341,13 @@ class Agreement:
     def _pose_problems(self) -> Iterator[Problem]:
         if AS_READ not in self.readings:
             gain = self.sharpness[Hypothesis(reading=self.readings[0])] / self.sharpness[AS_STATED]
+            fault = self.readings[0].fault_of_events
             yield Problem(
                 f"The poses fit the events when they are read as {_either(self.readings)}: events are then {gain:.1f} "
                 "times as sharp.",
                 "State the poses camera to world, with quaternions x y z w and OpenCV's axes of the camera (x right, y "
                 "down, z forward)"
+                + (f"; or, if the poses are right, {fault}" if fault else "")
                 + ("; this motion does not show which of these readings is right." if len(self.readings) > 1 else "."),
             )
         elif SCALAR_FIRST in self.readings and _is_half_turn(self.focus.recording.trajectory):

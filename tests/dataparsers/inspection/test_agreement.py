@@ -141,6 +141,41 @@ def test_poses_of_another_convention_are_named(
     assert f"read as {named}: events are then" in words(found)
 
 
+@pytest.mark.parametrize(
+    ("fault", "named", "mend"),
+    [
+        (lambda read: faults.exchanged(read, "size"), "x and y are exchanged", "exchange both columns"),
+        (lambda read: faults.exchanged(read, "all"), "x and y are exchanged", "exchange both columns"),
+        (
+            lambda read: faults.turned_events(read, lambda events, camera: (camera.width - 1 - events.x, events.y)),
+            "mirrored axes with x left, y down",
+            "write width - 1 - x for x",
+        ),
+        (
+            lambda read: faults.turned_events(read, lambda events, camera: (events.x, camera.height - 1 - events.y)),
+            "mirrored axes with x right, y up",
+            "write height - 1 - y for y",
+        ),
+        (
+            lambda read: faults.turned_events(faults.exchanged(read, "all"), lambda e, c: (c.width - 1 - e.x, e.y)),
+            "quarter of a turn (x up, y right)",
+            "write y for x, and width - 1 - x for y",
+        ),
+        (
+            lambda read: faults.turned_events(faults.exchanged(read, "all"), lambda e, c: (e.x, c.height - 1 - e.y)),
+            "quarter of a turn (x down, y left)",
+            "write height - 1 - y for x, and x for y",
+        ),
+    ],
+    ids=["sizes too", "all", "x", "y", "quarter", "other quarter"],
+)
+def test_exchanged_and_mirrored_axes_of_the_sensor_are_named(shaken: EventRecording, fault, named: str, mend: str):
+    found = agreement(fault(shaken))
+    assert len(found.readings) == 1 and named in found.readings[0].words
+    assert named in words(found) and f"if the poses are right, {found.readings[0].fault_of_events}." in words(found)
+    assert mend in words(found)
+
+
 def test_poses_of_a_body_are_reread_before_the_camera_is_mounted(shaken: EventRecording):
     mount = np.eye(4)
     mount[:3, :3], mount[:3, 3] = Rotation.from_euler("xyz", [0.7, -0.4, 1.9]).as_matrix(), [0.05, -0.02, 0.1]
