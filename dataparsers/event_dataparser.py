@@ -220,7 +220,7 @@ def go_on_without_lpips() -> None:
             print("lpips is left out (nan): its weights cannot be downloaded; get them by enerf fetch-lpips alex.")
             with torch.device("meta"):
                 layers = alexnet(weights=None).state_dict()
-            return {name: torch.full(layer.shape, torch.nan) for name, layer in layers.items()}
+            return {name: torch.tensor(torch.nan).expand(layer.shape) for name, layer in layers.items()}
 
     AlexNet_Weights.get_state_dict = state
 

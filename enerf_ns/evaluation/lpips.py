@@ -78,7 +78,9 @@ def _weights(network: Network) -> dict[str, Tensor]:
     with torch.device("meta"):
         layers = get_model(network.model, weights=None).state_dict()
     return {
-        name: weights[name.removeprefix("features.")] if name.startswith("features.") else torch.zeros(layer.shape)
+        name: weights[name.removeprefix("features.")]
+        if name.startswith("features.")
+        else torch.zeros(()).expand(layer.shape)  # which needs no memory
         for name, layer in layers.items()
     }
 
