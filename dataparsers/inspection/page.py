@@ -136,7 +136,7 @@ class Inspection:
             unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
         agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
         problems = [*(agreement.problems() if agreement else []), *sensor.problems()]
-        problems += [*find_problems(recording, near_far), *unknown]
+        problems += [*find_problems(recording, near_far, statistics), *unknown]
         as_read = recording.as_read
         as_stated = None if as_read is None else Agreement.of(as_read, near_far)
         return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated)

@@ -174,17 +174,22 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
     )
 
 
-def find_problems(recording: EventRecording, depth_range: tuple[float, float] | None = None) -> list[Problem]:
+def find_problems(
+    recording: EventRecording,
+    depth_range: tuple[float, float] | None = None,
+    statistics: EventStatistics | None = None,
+) -> list[Problem]:
     """Problems of a recording, with advice. Takes seconds once the events are indexed.
 
     Args:
         recording: Its index is made if it is not there yet.
         depth_range: Nearest and farthest depth, metres. Default: the range that the recording states, if any.
+        statistics: Those of the recording. Default: they are measured here, with at most `SAMPLED_EVENTS` events.
 
     Raises:
         RecordingError: The events cannot be used.
     """
-    statistics = event_statistics(recording, SAMPLED_EVENTS)
+    statistics = statistics or event_statistics(recording, SAMPLED_EVENTS)
     depth_range = depth_range or recording.depth_range
     gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
     silences, bursts = unusual_rates(recording, statistics, depth_range)

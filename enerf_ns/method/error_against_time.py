@@ -17,7 +17,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.colormaps import apply_depth_colormap
 from torch import Tensor
 
-from enerf_ns.dataparsers.recording.errors import UserError
+from enerf_ns.dataparsers.recording.errors import UserError, printable
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
 from enerf_ns.evaluation.lpips import lpips
@@ -137,7 +137,8 @@ class ErrorAgainstTime:
             if dataset.are_frames:
                 picture = torch.zeros(64, 64, 3)
                 ssim(picture, picture)
-                lpips(picture, picture)
+                if isinstance(missing := lpips(picture, picture), str):
+                    print(printable(f"No lpips: {missing}."))
             self.pipeline.eval()
             held_out_view(
                 self.pipeline, self._numbers[0], min(dataset.frames.camera.height, dataset.frames.camera.width)

@@ -581,7 +581,8 @@ class EnerfTrainer(Trainer):
             "checkpoint": quoted(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
             "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
-            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4",
+            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4 "
+            "--rendered-output-names display",
             "viewer": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from nerfstudio.cameras.cameras import Cameras
 
-PICTURE_ROWS = 3
-"""Number of held-out frames shown in the picture."""
 POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event": NO_EVENT}
 """Colours of an `event_picture` by meaning."""
 UNKNOWN = "#c9ced8"
@@ -53,11 +51,6 @@ class Column:
     """Values at both ends of the colour scale."""
     opacities: Sequence[np.ndarray] | None = None
     """Opacity of each picture over grey, 0 to 1 (height, width). None: 1."""
-
-
-def shown_numbers(number: int) -> list[int]:
-    """Numbers of the held-out frames that are shown, evenly chosen."""
-    return np.unique(np.linspace(0, number - 1, PICTURE_ROWS).round().astype(int)).tolist()
 
 
 def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> Figure:

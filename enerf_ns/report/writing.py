@@ -19,6 +19,7 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
 from enerf_ns.dataparsers.recording.files import fill_page, write_together
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import EXPECTED_SCALE, aligned_views
@@ -27,7 +28,7 @@ from enerf_ns.method.runs import Run, load
 from enerf_ns.poses.findings import findings
 from enerf_ns.report.figures import SCORES, Curve, error_against, step_breakdown, work_precision
 from enerf_ns.report.film import Screen, render_moving, render_video
-from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
+from enerf_ns.report.pictures import camera_path, side_by_side
 from enerf_ns.report.pose_figure import corrections_over_time
 from enerf_ns.report.run_files import RunFiles, read_run, run_names
 from enerf_ns.report.scoring import DEFAULT_SCORING, Scoring

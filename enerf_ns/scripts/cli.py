@@ -8,8 +8,6 @@ import signal
 import sys
 from importlib import import_module
 
-import tyro
-
 from enerf_ns import __version__
 from enerf_ns.dataparsers.recording.errors import exit_with_a_sentence, printable
 from enerf_ns.quiet import silence_known_warnings
@@ -20,6 +18,7 @@ COMMANDS = {
     "convert": ("Convert", "write a recording or an event file in the format of this package"),
     "demo": ("Demo", "simulate, train, and report with a video, in five minutes"),
     "export": ("Export", "write a mesh, a point cloud or the refined poses of a run"),
+    "fetch-lpips": ("FetchLpips", "download the weights that the score LPIPS needs"),
     "inspect": ("Inspect", "check a recording before training on it"),
     "reconstruct": ("Reconstruct", "reconstruct frames from the events of a recording"),
     "report": ("Report", "show scores, error against time, pictures and videos of runs"),
@@ -29,7 +28,22 @@ COMMANDS = {
 
 
 def entrypoint() -> None:
-    """Runs the command line. A mistake of the user ends it with one sentence."""
+    """Runs the command line.
+
+    A mistake of the user ends it with one sentence. It ends in silence when the reader of its output does, as `head`.
+    """
+    try:
+        _enerf()
+    except BrokenPipeError:
+        raise SystemExit(128 + signal.SIGPIPE) from None
+    finally:
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # Python would write it once more at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _enerf() -> None:
     silence_known_warnings()
     name, arguments = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
     if name in ("-h", "--help"):
@@ -75,6 +89,8 @@ def _run(name: str, arguments: list[str]) -> None:
     try:
         with exit_with_a_sentence():
             command = _imported(name)
+            import tyro  # here, since SIGINT ends an import with a traceback
+
             tyro.cli(command, prog=f"enerf {name}", args=arguments).main()
     except MemoryError as error:
         asked = printable(shlex.join(["enerf", name, *arguments]))

@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.index.event_index import EventIndex, event_picture
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.metrics import KNOWN
 from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import Run
-from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
+from enerf_ns.report.pictures import camera_path, side_by_side
 
 
 def shown(run: Run) -> list[HeldOutView]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -102,11 +103,24 @@ def test_what_stops_it_from_outside_is_told(error: BaseException, code: object, 
     def stopped(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(cli.tyro, "cli", stopped)
+    monkeypatch.setattr("tyro.cli", stopped)
     monkeypatch.setattr(sys, "argv", ["enerf", "demo"])
     with pytest.raises(SystemExit) as end:
         cli.entrypoint()
     assert end.value.code == code
+
+
+@pytest.mark.parametrize("command", ["", "bench", "bench --help", "simulate shapes --output-dir new --width 16"])
+def test_it_ends_in_silence_when_the_reader_of_its_output_has_gone(command: str, tmp_path: Path):
+    """As with `enerf ... | head`, but before the first line. Printed by print, rich, tyro, and a bar of progress."""
+    read, write = os.pipe()
+    os.close(read)
+    words = [Path(sys.executable).with_name("enerf"), *command.split()]
+    if "simulate" in words:
+        words += ["--height", "12", "--duration", "0.05", "--num-frames", "11"]
+    ended = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, cwd=tmp_path, timeout=100)
+    os.close(write)
+    assert ended.returncode != 0 and ended.stderr == ""
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="what a process has loaded is told by Linux")

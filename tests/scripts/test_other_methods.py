@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,13 @@ METHODS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def lpips_without_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nerfstudio's methods download weights for LPIPS, a score that is not looked at here."""
-    random = torchvision.models.alexnet
-    monkeypatch.setattr(torchvision.models, "alexnet", lambda **_: random(weights=None))
+@pytest.fixture(autouse=True, scope="module")
+def no_weights_of_lpips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """There are none, neither in torchvision's folder nor at the address from which it downloads them."""
+    folder = tmp_path_factory.mktemp("nothing")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torchvision.models.AlexNet_Weights.DEFAULT.value, "url", (folder / "alexnet.pth").as_uri())
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +67,6 @@ def nerfacto(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a run of nerfacto."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("runs"))
-        random = torchvision.models.alexnet
-        patch.setattr(torchvision.models, "alexnet", lambda **_: random(weights=None))
         return train("nerfacto", recording, patch)
 
 
@@ -90,16 +90,21 @@ def test_methods_train_on_sharp_frames_and_are_scored(
     recording: Path,
     monkeypatch: pytest.MonkeyPatch,
     method: str,
+    capsys: pytest.CaptureFixture[str],
 ):
     before = contents(recording)
     config = train(method, recording, monkeypatch)
     pipeline: Any = eval_setup(config)[1]
+    capsys.readouterr()
     manager = pipeline.datamanager
     shown = manager.train_dataset.get_numpy_image(0)
     np.testing.assert_array_equal(shown, np.asarray(Image.open(recording / "images/00000.png").convert("RGB")))
     assert len(manager.eval_dataset) == NUM_HELD_OUT
     call("ns-eval", "--load-config", config, "--output-path", "scores.json")
-    assert 3 < json.loads(Path("scores.json").read_text())["results"]["psnr"] < 60
+    scores = json.loads(Path("scores.json").read_text())["results"]
+    assert 3 < scores["psnr"] < 60 and np.isnan(scores["lpips"])
+    printed = capsys.readouterr().out
+    assert printed.count("lpips is left out (nan): its weights cannot be downloaded; get them by enerf") == 1
     assert contents(recording) == before
 
 

@@ -309,9 +309,9 @@ def test_render_dataset(call, run: Path):
 
 def test_render_dataset_downscaled(call, run: Path):
     call("ns-render", "dataset", "--load-config", run, "--output-path", "renders", "--image-format", "png",
-         "--downscale-factor", 2, "--rendered-output-names", "rgb", "gt-rgb", "raw-gt-depth")  # fmt: skip
+         "--downscale-factor", 2, "--rendered-output-names", "rgb", "display", "gt-rgb", "raw-gt-depth")  # fmt: skip
     recording, size = yaml.load(run.read_text(), Loader=yaml.Loader).data, (WIDTH // 2, HEIGHT // 2)
-    assert Image.open("renders/test/rgb/00002.png").size == size
+    assert {Image.open(f"renders/test/{name}/00002.png").size for name in ("rgb", "display")} == {size}
     frame = Image.open(recording / "images/00002.png").convert("RGB").resize(size, Image.Resampling.HAMMING)
     np.testing.assert_array_equal(np.asarray(Image.open("renders/test/gt-rgb/00002.png")), np.asarray(frame))
     with gzip.open("renders/test/raw-gt-depth/00002.npy.gz") as file:
@@ -422,8 +422,10 @@ def test_the_viewer_answers(run: Path, tmp_path: Path):
         viewer.wait()
 
 
-def test_eval_without_frames(call, run_without_frames: Path):
+def test_eval_without_frames(call, run_without_frames: Path, capsys: pytest.CaptureFixture[str]):
     call("ns-eval", "--load-config", run_without_frames, "--output-path", "scores.json")
+    printed = capsys.readouterr().out
+    assert "Protocol events: there are no frames." in printed and "\nNo " not in printed
     scores = json.loads(Path("scores.json").read_text())["results"]
     assert "psnr" not in scores, "a picture of events is no frame to compare with"
     assert -1.0 <= scores["event_correlation"] <= 1.0
