@@ -137,7 +137,7 @@ def run(home: Path) -> Path:
     before = contents(home / "recording")
     trained = start("ns-train", "enerf", "--data", "recording", *SMALL, cwd=home)
     assert trained.returncode == 0, trained.stdout + trained.stderr
-    for line in ("Recording", "Parts of the method", "Training is done"):
+    for line in ("Recording", "The field learns from", "Training is done"):
         assert line in trained.stdout
     (config,) = (home / "outputs/recording/enerf").glob("*/config.yml")
     assert contents(home / "recording") == before
