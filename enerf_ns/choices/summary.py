@@ -101,7 +101,7 @@ def _learned(scene: Scene) -> str:
     corrected = [part for part in PARTS if scene.value(f"poses.refine_{part}") is not False]
     sentences = [f"Training also learns the {_listed(learned)}."] if learned else []
     if corrected:
-        sentences.append(f"It corrects {_listed(corrected)} of the poses if events show that they are wrong.")
+        sentences.append(f"Training corrects {_listed(corrected)} of the poses if events show that they are wrong.")
     return " ".join(sentences)
 
 
