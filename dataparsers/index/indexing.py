@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Int64
+from rich import get_console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
@@ -197,7 +198,7 @@ def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
 
     def watched() -> Iterator[Events]:
         columns = (TextColumn("Indexing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
-        progress = Progress(*columns, transient=True)
+        progress = Progress(*columns, transient=True, disable=not get_console().is_terminal)
         task = progress.add_task("", total=num_events)
         begin = time.monotonic()
         try:

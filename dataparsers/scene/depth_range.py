@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import torch
 from jaxtyping import Float64
+from rich import get_console
 from rich.progress import track
 
 from enerf_ns.dataparsers.compiled import compiled
@@ -160,7 +161,8 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
     """
     path = _path(events, trajectory)
     extent, depths, num_by_chance, num_at_infinity = _extent(path[1]), [np.empty(0)], 0, 0
-    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True)
+    is_file = not get_console().is_terminal  # in which a bar leaves an empty line
+    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True, disable=is_file)
     planes = np.concatenate([DISPARITIES, -DISPARITIES])
     for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
         ahead, behind = np.split(sweep, 2, axis=1)

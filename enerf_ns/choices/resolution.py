@@ -124,6 +124,10 @@ class Resolution:
     """A row for each part of the method."""
     selection: tuple[str, ...] = ()
     """Notes about the preset, one sentence each."""
+    summary: tuple[str, ...] = ()
+    """What the field learns from, what is assumed, and what is learned beside it, one sentence each."""
+    flags_to_state: tuple[str, ...] = ()
+    """Flags of `ns-train` that state what the recording does not."""
 
     def applied_to(self, config: ConfigT) -> ConfigT:
         """A copy of a pipeline's config in which the open settings are filled in."""

@@ -99,6 +99,7 @@ class ErrorAgainstTime:
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
         """Seconds of each evaluation, by its kind."""
         self._line = StatusLine()
+        self._first = 0  # step of this session
         self._durations: deque[float] = deque(maxlen=STEPS_MEASURED)
         self._parts: dict[str, float] = {}
         self._is_due = False
@@ -128,6 +129,7 @@ class ErrorAgainstTime:
         """
         if state is not None:
             self.seconds, self.costs = state["seconds"], state["costs"]
+        self._first = steps_done
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
         if not self.share:
@@ -157,8 +159,10 @@ class ErrorAgainstTime:
         if timed:
             watch.lap("optimiser")
             self._parts = watch.stop()
-        self._durations.append(time.perf_counter() - begin)
-        self.seconds += self._durations[-1]
+        taken = time.perf_counter() - begin
+        self.seconds += taken
+        if number > self._first:  # which compiles
+            self._durations.append(taken)
 
     def after_step(self, number: int, metrics: dict[str, Tensor]) -> None:
         """Evaluates if a moment has come, and updates the line of progress.
@@ -278,13 +282,14 @@ class ErrorAgainstTime:
     def _status(self, done: int) -> str:
         """The line of progress. Its event correlation is a running mean over training pairs."""
         loss = sum(float(loss) for loss in self.pipeline.last_step.losses.values())
-        parts = [f"step {done} of {self.num_steps}", f"loss {loss:.4g}"]
+        parts = [f"step {done} of {self.num_steps}"]
+        if done < self.num_steps and self._durations:
+            parts.append(f"{duration(self._total(done) - self.seconds)} left")  # first, since a terminal may be narrow
+        parts.append(f"loss {loss:.4g}")
         if self._correlation is not None:
             parts.append(f"event correlation {float(self._correlation):.3f} (training pairs)")
         if self._last is not None and "psnr" in self._last.scores:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
             parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
-        if done < self.num_steps:
-            parts.append(f"{duration(self._total(done) - self.seconds)} left")
         return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""The seams to Nerfstudio, viser and torch: everything that this package uses of them beyond their public interfaces.
+"""The seams to Nerfstudio, viser, torch and tyro: all that this package uses of them beyond their public interfaces.
 
 Functions here reach into a package where it has no public way. `SEAMS` lists these places, and those of overridden
 methods and of the rooms below. tests/method/test_nerfstudio_seams.py walks the list: after an update of a package it
@@ -36,7 +36,7 @@ class Seam:
     """Names of the parameters of a function or method; None for anything else."""
 
 
-READ_IN = {"nerfstudio": "1.1.5", "viser": "0.2.7", "torch": "2.11.0"}
+READ_IN = {"nerfstudio": "1.1.5", "viser": "0.2.7", "torch": "2.11.0", "tyro": "1.0.17"}
 """Version of each package in which its seams were read."""
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
@@ -47,6 +47,7 @@ _SAMPLERS = "nerfstudio.model_components.ray_samplers"
 _RENDERER = "nerfstudio.viewer.render_state_machine:RenderStateMachine"
 _PANEL = "nerfstudio.viewer.control_panel:ControlPanel"
 _ENCODING = "nerfstudio.field_components.encodings:HashEncoding"
+_HELP = "tyro._backends._tyro_help_formatting"
 
 SEAMS = (
     # private methods that are overridden
@@ -122,6 +123,21 @@ SEAMS = (
     Seam("nerfstudio.field_components.mlp:MLP.layers", "kernels.network and network_numba read the weights"),
     Seam("nerfstudio.utils.rich_utils:CONSOLE", "terminal.without_chatter replaces print and log within a block"),
     *(Seam(f"torch.optim.adam:Adam.{name}", "leave_out_fused_step") for name in ("found_inf", "grad_scale")),
+    # without which flags.speak_for_methods leaves help and errors to tyro
+    Seam(
+        f"{_HELP}:format_help",
+        "flags groups the flags of this package's methods",
+        ("prog", "parser_spec", "args", "subparser_frontier", "verbose"),
+    ),
+    Seam(
+        f"{_HELP}:unrecognized_args_error",
+        "flags names the nearest flag",
+        (
+            *("prog", "unrecognized_args_and_progs", "subparser_frontier", "args", "parser_spec"),
+            *("console_outputs", "add_help"),
+        ),
+    ),
+    Seam("tyro._arguments:generate_argument_helptext", "flags shows the text of a flag", ("arg", "lowered", "compact")),
 )
 """All seams, those of this module and those of others."""
 

@@ -69,6 +69,35 @@ def test_what_is_no_command_is_one_sentence(name: str, monkeypatch, capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
+        (["inspec"], "There is no command inspec; the nearest is inspect."),
+        (["simulate", "--widht", "3"], "There is no flag --widht; the nearest is --width. enerf simulate --help lists"),
+        (["simulate", "shapes", "--output_dri=x"], "There is no flag --output_dri; the nearest is --output-dir."),
+        (["inspect", "--outptu", "x"], "There is no flag --outptu; the nearest is --output."),
+    ],
+)
+def test_a_word_that_is_misspelt_is_told_in_a_sentence(
+    arguments: list[str], sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["enerf", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.entrypoint()
+    out, error = capsys.readouterr()
+    assert (end.value.code, out, error.count("\n")) == (2, "", 1)
+    assert error.startswith("enerf: ") and sentence in error
+
+
+def test_what_else_is_wrong_with_flags_is_told_by_tyro(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["enerf", "simulate", "shapes"])
+    with pytest.raises(SystemExit) as end:
+        cli.entrypoint()
+    assert end.value.code == 2 and "--output-dir PATH" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
         (["inspect", "nowhere"], "nowhere does not exist"),
         (["convert", "nowhere", "--output-dir", "new"], "nowhere does not exist"),
         (["bench", "nothing"], "There is no experiment nothing; choose one of"),

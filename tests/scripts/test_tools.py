@@ -145,7 +145,7 @@ def run(home: Path) -> Path:
     command = [Path(sys.executable).with_name("ns-train"), "enerf", "--data", "recording", *SMALL]
     trained = subprocess.run(command, cwd=home, env=environment_of(home), capture_output=True, text=True, timeout=300)
     assert trained.returncode == 0, trained.stdout + trained.stderr
-    for line in ("Recording", "Parts of the method", "Training is done"):
+    for line in ("Recording", "The field learns from", "Training is done"):
         assert line in trained.stdout
     (config,) = (home / "outputs/recording/enerf").glob("*/config.yml")
     assert contents(home / "recording") == before
