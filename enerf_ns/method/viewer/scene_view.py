@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.datamanager import EnerfDataManager
 from enerf_ns.method.model import EnerfModel, Outputs
 from enerf_ns.method.nerfstudio_seams import replace_camera_callbacks, replace_renderer, tidy_control_panel
-from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events
+from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events, unknown
 from enerf_ns.method.viewer.seen_rays import SeenRays
 from enerf_ns.method.viewer.view_renderer import ViewRenderer
 
@@ -61,6 +61,9 @@ LOOKED_EVERY = 1.1
 
 ACCENT = (255, 211, 105)
 """Colour of the trajectory and the sensor."""
+
+NERFSTUDIO_BACKGROUND, UNKNOWN = (38, 42, 55), (100, 100, 100)
+"""Background colour of Nerfstudio's viewer, and the colour here of the lighter squares where nothing was seen."""
 
 STATED = (150, 150, 150)
 """Colour of the trajectory before corrections."""
@@ -129,6 +132,8 @@ class SceneView(ViewerControl):
             viewer.config.camera_frustum_scale = FRUSTUM * self._depth * VISER_NERFSTUDIO_SCALE_RATIO
         if viewer.config.max_num_display_images == defaults.max_num_display_images:
             viewer.config.max_num_display_images = MOST_CAMERAS
+        if viewer.control_panel.background_color == NERFSTUDIO_BACKGROUND:
+            viewer.control_panel.background_color = UNKNOWN
         tidy_control_panel(viewer.control_panel, FULL_WIDTH)
         if viewer.trainer is None:
             viewer.pause_train.visible = viewer.resume_train.visible = False
@@ -310,17 +315,19 @@ class SceneView(ViewerControl):
         """
         rgb, depth, share = outputs["rgb"], outputs["depth"], outputs["accumulation"]
         points = rays.origins + rays.directions * depth
-        if self._seen is not None and not self._model.config.contraction:
-            is_seen = self._seen.may_be_surface(points)[..., None]
-            rgb, share = rgb * is_seen, share * is_seen
-        behind = rgb.new_tensor(self.viewer.control_panel.background_color) / 255.0
-        rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value, share, behind)
+        is_known = torch.ones_like(share, dtype=torch.bool)
+        if self._seen is not None:
+            beyond = self._model.config.contraction  # whether space beyond the box is rendered, too
+            is_known = (share > 0.5) & self._seen.may_be_surface(points, beyond)[..., None]
+            rgb = rgb / share.clamp(min=0.5)
+        rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value)
+        rgb = rgb.where(is_known, unknown(rgb.shape[:2], self.viewer.control_panel.background_color).to(rgb))
         if self._events.value:
             moment = self._moment
             begin = moment - round(self._window.value * 1e6)
             events = recent_events(self._manager.index, self._recording.camera, begin, moment)
             rgb = draw_events(rgb, points, events, self._camera, self._pose(moment))
-        shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, share > 0.5)})
+        shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, is_known & (share > 0.5))})
         path = torch.from_numpy(self._path).to(rays.origins)
         away = float((path - rays.origins[0, 0]).norm(dim=-1).min())
         for handle in self._drawn:  # near the trajectory, drawn lines and cameras hide the scene
