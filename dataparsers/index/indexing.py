@@ -174,6 +174,8 @@ def _why_outside(recording: EventRecording) -> str:
     camera, pieces = recording.camera, list(_largest_of_pieces(recording))
     across, down = (max(column) + 1 for column in zip(*pieces, strict=True))
     found = f"; all x lie below {across:,} and all y below {down:,}"
+    if across <= camera.width and down <= camera.height:
+        return ""  # numbers below 0
     if across <= camera.height and down <= camera.width:
         if camera.has_sides_swapped:
             return f"{found}, so width and height of the calibration seem to be swapped: exchange them"

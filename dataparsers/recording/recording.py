@@ -420,8 +420,7 @@ class EventRecording:
 
     @property
     def _times_of_poses(self) -> Times:
-        times = self.trajectory.times
-        return Times.of_rows("poses", *self._file_of("poses"), times)
+        return Times.of_rows("poses", *self._file_of("poses"), self.trajectory.times)
 
     def _times_of(self, frames: Frames, what: str) -> Times:
         return Times.of_rows("frames", *self._file_of(what), frames.times)
