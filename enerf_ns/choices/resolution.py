@@ -124,6 +124,8 @@ class Resolution:
     """A row for each part of the method."""
     selection: tuple[str, ...] = ()
     """Notes about the preset, one sentence each."""
+    cause: str = ""
+    """Likely cause why the events cannot be explained, as a clause; empty if nothing is known to be wrong."""
 
     def applied_to(self, config: ConfigT) -> ConfigT:
         """A copy of a pipeline's config in which the open settings are filled in."""

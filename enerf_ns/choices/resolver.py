@@ -37,6 +37,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     brightness.colour,
     extent.undistortion,
     extent.box,
+    extent.explainable,
     extent.contraction,
     frames.exposure,
     extent.hash_grid,
@@ -77,4 +78,4 @@ def resolve(
         row(scene)
     rays.view_direction(scene, probe)
     rays.larger_batch(scene, batch_factor)
-    return Resolution(scene.values, tuple(scene.choices), tuple(scene.selection))
+    return Resolution(scene.values, tuple(scene.choices), tuple(scene.selection), scene.cause)

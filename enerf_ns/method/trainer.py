@@ -292,6 +292,8 @@ class EnerfTrainerConfig(TrainerConfig):
             for line in resolution.selection:
                 CONSOLE.print(Text(f"* {printable(line)}"))
             CONSOLE.print(choices_table(resolution.choices))
+            if resolution.cause:
+                say(f"Training will hardly explain the events, because {resolution.cause}.")
             folder = config.get_base_dir()
             choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
             try:
@@ -570,7 +572,7 @@ class EnerfTrainer(Trainer):
             super()._after_train()
         if self._unsaved:
             raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and continue.")
-        CONSOLE.rule("Training is done")
+        self._say_verdict()
         self._say_skipped()
         learned = self.pipeline.model.sensor.learned()
         if learned:
@@ -585,6 +587,15 @@ class EnerfTrainer(Trainer):
             "viewer": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)
+
+    def _say_verdict(self) -> None:
+        """Prints the end of the training, and whether its field explains the events."""
+        found = self.error_against_time.verdict
+        CONSOLE.rule("Training is done" + (f": {found.short}" if found else ""))
+        if found is not None and found.explained == "yes":
+            CONSOLE.print(printable(found.sentence), soft_wrap=True, markup=False, highlight=False)
+        elif found is not None:
+            say(found.sentence)
 
     def _say_poses(self) -> None:
         """Prints the errors that were found in clock, poses and lens, and stores them with the run."""
