@@ -26,7 +26,8 @@ def test_a_run_says_at_both_ends_whether_its_poses_are_wrong(is_wrong: bool, tmp
     events = replace(events, p=np.where(np.arange(len(events)) % 2, 1, -1).astype(np.int8))
     poses = INVERSE.of(trajectory) if is_wrong else trajectory
     recording = EventRecording(tmp_path, "test", CAMERA, poses, lambda: iter([events]), ())
-    config = small_config(write_event_recording(recording, tmp_path / "recording"), tmp_path / "runs")
+    folder = write_event_recording(recording, tmp_path / "recording")
+    config = small_config(folder, tmp_path / "runs", data__held_out_events=0.2)
     config.pipeline.datamanager.dataparser.depth_range = 0.8, 4.0
     config.pipeline.model.sensor.contrast_thresholds = 0.25, 0.25
     config.max_num_iterations = 5

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import faults
@@ -16,6 +15,7 @@ from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.poses.corrections import Corrections
 
 STATED = 0.8, 4.0
 
@@ -42,10 +42,8 @@ FAULTS = pytest.mark.parametrize(
         pytest.param(faults.scalar_first, "quaternions in the order w x y z", "move the first number", id="w x y z"),
         pytest.param(faults.opengl, "OpenGL's camera axes", "from the right by diag(1, -1, -1)", id="OpenGL"),
         pytest.param(lambda read: faults.mirrored(read, 1), "mirrored axes", "M = diag(1, -1, 1)", id="mirrored"),
-        pytest.param(lambda read: faults.poses_late(read, 23), "stamped 23.", "take 23.", id="late"),
-        pytest.param(
-            lambda read: faults.longer_focal_length(read, 2.0), "focal length is wrong: 0.5", "fx and fy", id="lens"
-        ),
+        pytest.param(lambda read: faults.poses_late(read, 23), "the clocks disagree by 2", "ms off the times", id="late"),
+        pytest.param(lambda read: faults.longer_focal_length(read, 2.0), "focal length is wrong", "fx and fy", id="lens"),
     ],
 )
 
@@ -59,6 +57,8 @@ def cause_of(recording: EventRecording) -> str:
     return why_not_explained(recording, depth_range, recording) or ""
 
 
+@pytest.mark.sweep(2)
+@pytest.mark.slow
 @FAULTS
 def test_each_fault_is_named_whether_a_depth_range_is_stated_or_not(
     shaken: EventRecording, fault: Callable[[EventRecording], EventRecording], cause: str, mend: str
@@ -69,6 +69,8 @@ def test_each_fault_is_named_whether_a_depth_range_is_stated_or_not(
         assert f"enerf inspect {shlex.quote('a memory')}" in found and "--depth-range" not in found
 
 
+@pytest.mark.sweep(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [faults.inverse, faults.opengl, other_poses])
 def test_the_mend_of_wrong_poses_is_never_a_depth_range(
     shaken: EventRecording, fault: Callable[[EventRecording], EventRecording]
@@ -103,6 +105,6 @@ def test_without_a_cause_the_depth_range_is_asked_for():
 def test_the_cause_is_searched_in_the_recording_as_read(shaken: EventRecording):
     """Corrections that were found with wrong poses are wrong, too."""
     read = faults.inverse(shaken)
-    corrected = replace(faults.poses_late(read, 30), as_read=read)
+    corrected = Corrections(delay=30.0).recording(read)
     with pytest.raises(RecordingError, match="read as world to camera, the inverse"):
         depth_range_or_cause(corrected, as_read=read)
