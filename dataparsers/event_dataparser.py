@@ -29,12 +29,12 @@ from tyro.conf import Suppress
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.index.picture_files import write_pictures
+from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 with warnings.catch_warnings(), suppress(ImportError):  # hides two warnings that Nerfstudio would show at each start
@@ -145,7 +145,7 @@ class EventDataParser(DataParser):
             RecordingError: The depth range is neither stated nor measurable, or all frames lie in gaps of the poses.
             FlagError: The frames cannot be downscaled by this factor.
         """
-        near, far = scene_depth_range(recording, self.config.depth_range)
+        near, far = depth_range_or_cause(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
         frames, are_frames = split_frames(recording, self.config, held_out=split != "train")
 

@@ -128,6 +128,8 @@ class Resolution:
     """What the field learns from, what is assumed, and what is learned beside it, one sentence each."""
     flags_to_state: tuple[str, ...] = ()
     """Flags of `ns-train` that state what the recording does not."""
+    cause: str = ""
+    """Likely cause why the events cannot be explained, as a clause; empty if nothing is known to be wrong."""
 
     def applied_to(self, config: ConfigT) -> ConfigT:
         """A copy of a pipeline's config in which the open settings are filled in."""

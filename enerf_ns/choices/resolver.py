@@ -38,6 +38,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     brightness.colour,
     extent.undistortion,
     extent.box,
+    extent.explainable,
     extent.contraction,
     frames.exposure,
     extent.hash_grid,
@@ -79,5 +80,5 @@ def resolve(
     rays.view_direction(scene, probe)
     rays.larger_batch(scene, batch_factor)
     return Resolution(
-        scene.values, tuple(scene.choices), tuple(scene.selection), in_words(scene), flags_to_state(scene)
+        scene.values, tuple(scene.choices), tuple(scene.selection), in_words(scene), flags_to_state(scene), scene.cause
     )

@@ -24,6 +24,7 @@ from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL
 from enerf_ns.evaluation.scores import NotScored, mean_scores, summary_scores
+from enerf_ns.evaluation.verdict import FEW_STEPS, Verdict, verdict_on_events
 from enerf_ns.evaluation.views import png
 from enerf_ns.method.checkpoints import random_state, set_random_state
 from enerf_ns.method.held_out_views import held_out_view, held_out_views
@@ -98,6 +99,9 @@ class ErrorAgainstTime:
         """Time (s) of all training steps, without evaluation, checkpoints and the viewer."""
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
         """Seconds of each evaluation, by its kind."""
+        self.verdict: Verdict | None = None
+        """Verdict of the last evaluation; None before the first, and if the field does not learn from events."""
+        self._is_said = False
         self._line = StatusLine()
         self._first = 0  # step of this session
         self._durations: deque[float] = deque(maxlen=STEPS_MEASURED)
@@ -260,12 +264,25 @@ class ErrorAgainstTime:
         not_scored |= {name: {why: []} for name, why in found.items() if isinstance(why, str)}
         scores = {name: float(score) for name, score in found.items() if isinstance(score, (int, float))}
         losses = {name: float(loss) for name, loss in pipeline.last_step.losses.items()}
+        self._judge(found, done, final)
+        words = self.verdict.sentence if self.verdict else ""
         self._last = HistoryRow(
-            done, self.seconds, losses, scores, len(views), self._parts, final, not_scored, protocol
+            done, self.seconds, losses, scores, len(views), self._parts, final, not_scored, protocol, words
         )
         for name, score in scores.items():
             writer.put_scalar(f"Held-out/{name}", score, done)
         append_row(self.folder, self._last)
+
+    def _judge(self, scores: dict[str, Any], done: int, final: bool) -> None:
+        """Judges whether the events are explained. During training it is printed once that they are not."""
+        manager, config = self.pipeline.datamanager, self.pipeline.config
+        if "events" not in manager.config.supervision:
+            return
+        pairs, path = self.pipeline.num_scored_pairs, manager.recording.path
+        self.verdict = verdict_on_events(scores, pairs, done, config.resolution.cause, path)
+        if self.verdict.explained == "no" and not final and done >= FEW_STEPS and not self._is_said:
+            self._is_said = True
+            say(f"Step {done}: {self.verdict.sentence}")
 
     def _preview(self, done: int) -> None:
         """Stores a picture of the first frame that moments score, its render, aligned alone, and its depth."""
@@ -292,4 +309,6 @@ class ErrorAgainstTime:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
             parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
+        if self.verdict is not None and self.verdict.explained == "no":
+            parts.append(self.verdict.short)
         return ", ".join(parts)

@@ -359,6 +359,13 @@ class EnerfPipeline(VanillaPipeline):
         self.train()
         return results
 
+    @property
+    def num_scored_pairs(self) -> int:
+        """Number of different pairs of events that `event_scores` draws from, or of all events if none are held out."""
+        manager = self.datamanager
+        sampler = manager.held_out_pair_sampler if manager.config.held_out_events else manager.index
+        return 0 if isinstance(sampler, str) else len(sampler)
+
     @torch.no_grad()
     def event_scores(self, num_pairs: int = 2048) -> dict[str, Score]:
         """The scores of the protocol "events" over random pairs of held-out events.

@@ -314,6 +314,8 @@ class EnerfTrainerConfig(TrainerConfig):
                 say_where("better with", flag)
             if self.verbose:
                 CONSOLE.print(Text(choices_text(resolution.choices, columns())), soft_wrap=True)
+            if resolution.cause:
+                say(f"Training will hardly explain the events, because {resolution.cause}.")
             folder = config.get_base_dir()
             files = {
                 "config.yml": yaml.dump(config),
@@ -622,7 +624,7 @@ class EnerfTrainer(Trainer):
             super()._after_train()
         if self._unsaved:
             raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and continue.")
-        say_table(Rule("Training is done"))
+        self._say_verdict()
         self._say_skipped()
         learned = self.pipeline.model.sensor.learned()
         if learned:
@@ -639,6 +641,15 @@ class EnerfTrainer(Trainer):
         }.items():
             say_where(what, where)
         self._end_viewer("has ended")
+
+    def _say_verdict(self) -> None:
+        """Prints the end of the training, and whether its field explains the events."""
+        found = self.error_against_time.verdict
+        say_table(Rule("Training is done" + (f": {found.short}" if found else "")))
+        if found is not None and found.explained == "yes":
+            say_plainly(found.sentence)
+        elif found is not None:
+            say(found.sentence)
 
     def _say_poses(self) -> None:
         """Prints the errors that were found in clock, poses and lens, and stores them with the run."""

@@ -58,6 +58,8 @@ class _Reported:
     seconds: float | None = None
     """Training time up to the scored step, s."""
     events: int | None = None
+    verdict: str = ""
+    """Sentence on whether the events are explained; empty if the run did not learn from events."""
     picture: tuple[str, bytes] | None = None
     """Name and content of the file with the held-out frames."""
     video: bytes | None = None
@@ -77,6 +79,7 @@ class _Reported:
         """The entry of the run in scores.json."""
         entry: dict[str, Any] = {"state": self.files.state, "step": self.step, "train_seconds": self.seconds}
         entry |= {"events": self.events} if self.events is not None else {}
+        entry |= {"verdict": self.verdict} if self.verdict else {}
         over = {"protocol": self.protocol, "num_frames": self.num_frames} if self.scores else {}
         return entry | over | {"over_all_frames": self.over_all_frames} | self.scores
 
@@ -173,7 +176,7 @@ def _look_at(one: _Reported, run: Run | None, output_dir: Path, scoring: Scoring
         one.step, one.num_frames, one.over_all_frames = scored.step, scored.num_frames, scored.final
         one.scores = {**dict.fromkeys(("psnr", "ssim", "lpips")), **scored.scores}
         one.scores |= {"not_scored": scored.not_scored} if scored.not_scored else {}
-        one.protocol = scored.protocol
+        one.protocol, one.verdict = scored.protocol, scored.verdict
     else:
         one.step = one.files.steps
     if run is None:
@@ -422,6 +425,7 @@ def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[
     return fill_page(
         Path(__file__).with_name("report.html"),
         title=_title(reported),
+        verdicts=_verdicts(reported),
         tables=tables,
         figures=[{"title": title, "uri": _data_uri("image/png", content)} for title, content in figures.values()],
         runs=runs,
@@ -430,7 +434,7 @@ def _page(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[
 
 def _markdown(reported: Sequence[_Reported], tables: Sequence[Table], figures: dict[str, str]) -> str:
     """The contents of the page in Markdown, with links to the files."""
-    parts = [f"# {_title(reported)}"]
+    parts = [f"# {_title(reported)}", *_verdicts(reported)]
     for table in tables:
         parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
     for name, title in figures.items():
@@ -443,6 +447,11 @@ def _markdown(reported: Sequence[_Reported], tables: Sequence[Table], figures: d
         if one.video is not None:
             parts.append(f"[Video]({one.prefix}video.mp4). {one.video_note}")
     return "\n\n".join(parts) + "\n"
+
+
+def _verdicts(reported: Sequence[_Reported]) -> list[str]:
+    """A sentence for each run that learned from events: whether its field explains them, and what to try if not."""
+    return [f"{one.name}: {one.verdict}" if len(reported) > 1 else one.verdict for one in reported if one.verdict]
 
 
 def _title(reported: Sequence[_Reported]) -> str:
