@@ -66,6 +66,7 @@ from enerf_ns.method.guarded_steps import (
 )
 from enerf_ns.method.model import EnerfModel
 from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
+from enerf_ns.method.origin import ORIGIN_FILE, origin
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
 from enerf_ns.method.throughput import batch_factor
@@ -284,7 +285,7 @@ class EnerfTrainerConfig(TrainerConfig):
         """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Prints tables of the recording and of the choices for it, and stores config.yml and choices.json."""
+        """Prints tables of the recording and of the choices for it, and stores config.yml, choices.json and origin.json."""
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
@@ -293,9 +294,10 @@ class EnerfTrainerConfig(TrainerConfig):
                 CONSOLE.print(Text(f"* {printable(line)}"))
             CONSOLE.print(choices_table(resolution.choices))
             folder = config.get_base_dir()
-            choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
+            about = {"choices.json": [asdict(choice) for choice in resolution.choices], ORIGIN_FILE: origin()}
+            files = {name: json.dumps(content, indent=2).encode() for name, content in about.items()}
             try:
-                write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
+                write_together(folder, {"config.yml": yaml.dump(config).encode(), **files})
             except OSError as error:
                 raise _unwritable(folder, error) from error
             say_where("configuration", quoted(folder / "config.yml"))
