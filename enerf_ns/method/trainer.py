@@ -285,7 +285,7 @@ class EnerfTrainerConfig(TrainerConfig):
         """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Prints tables of the recording and of the choices for it, and stores config.yml, choices.json and origin.json."""
+        """Prints tables of recording and choices, and stores config.yml, choices.json and origin.json."""
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
