@@ -222,7 +222,7 @@ def go_on_without_lpips() -> None:
                 layers = alexnet(weights=None).state_dict()
             return {name: torch.tensor(torch.nan).expand(layer.shape) for name, layer in layers.items()}
 
-    AlexNet_Weights.get_state_dict = state
+    AlexNet_Weights.get_state_dict = state  # type: ignore
 
 
 def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:

@@ -149,7 +149,7 @@ def _unknown(
     place = next((i for i, (word, _) in enumerate(given) if word.startswith("--")), 0)
     word, (tool, *words) = given[place][0], Path(given[place][1]).name.split()
     if not words:
-        method, _ = given[0]
+        method = given[0][0]
         near = close(method, names)
         return f"enerf: There is no method {method}; the nearest is {near}." if near else None
     method = _sub_commands(parser_spec)[words[0]].evaluate()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields
+from typing import Any
 
 import pytest
 import tyro
@@ -20,7 +21,8 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
     """The exit code of `ns-train` with some arguments, and what it prints to both of its outputs."""
     with pytest.raises(SystemExit) as end:
         tyro.cli(AnnotatedBaseConfigUnion, prog="/some where/ns-train", args=arguments)
-    return end.value.code, *capsys.readouterr()
+    printed = capsys.readouterr()
+    return end.value.code, printed.out, printed.err
 
 
 def flags_by_title(shown: str) -> dict[str, list[str]]:

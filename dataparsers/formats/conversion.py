@@ -99,7 +99,7 @@ def convert_event_file(
         num_events, _, last = event_recording.write_events(
             file.stream(), folder / "events", about["width"], about["height"], lambda i: f"{source}, event {i + 1},"
         )
-        if rows is not None:
+        if rows is not None and poses is not None:
             pixels = about["width"] * about["height"]
             events = Times.of_events(source, "us", num_events, last, pixels, is_certain=True)
             check_units(source, [events, Times.of_rows("poses", poses, poses_unit, rows[0], "--poses-unit")])

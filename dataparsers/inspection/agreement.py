@@ -371,10 +371,10 @@ class Agreement:
         if AS_READ not in self.readings:
             gain = self.sharpness[Hypothesis(reading=self.readings[0])] / self.sharpness[AS_STATED]
             yield Problem(
-                f"The poses fit the events when they are read as {_either(self.readings)}: events are then {gain:.1f} "
-                "times as sharp.",
-                f"{self._mend_of_readings()}; poses are read camera to world, with quaternions x y z w and OpenCV's axes "
-                "of the camera (x right, y down, z forward).",
+                f"The poses fit the events when they are read as {_either(self.readings)}: events are then "
+                f"{gain:.1f} times as sharp.",
+                f"{self._mend_of_readings()}; poses are read camera to world, with quaternions x y z w and OpenCV's "
+                "axes of the camera (x right, y down, z forward).",
             )
         elif SCALAR_FIRST in self.readings and _is_half_turn(self.focus.recording.trajectory):
             yield Problem(

@@ -54,7 +54,7 @@ from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.terminal import say, say_where
 
 if TYPE_CHECKING:
-    from nerfstudio.viewer.viewer_elements import ViewerControl
+    from enerf_ns.method.viewer.scene_view import SceneView
 
 SLOPE_PAIRS = 64
 """Number of pairs of a step at which slopes of brightness are rendered: enough to learn one number, the lag."""
@@ -155,7 +155,7 @@ class EnerfPipeline(VanillaPipeline):
         if "events" in config.datamanager.supervision and world_size == 1:
             self.poses = PoseRefiner(config.poses, self.datamanager.recording)
             self._correct_poses()
-        self._viewer: ViewerControl | None = None
+        self._viewer: SceneView | None = None
         self.model.seen_volume, self.model.display = self.seen_volume, self.shown
         self.world_size = world_size
         if world_size > 1:  # here, since Nerfstudio takes every device for a GPU
@@ -169,7 +169,7 @@ class EnerfPipeline(VanillaPipeline):
         return super().model  # type: ignore
 
     @property
-    def viewer(self) -> ViewerControl:
+    def viewer(self) -> SceneView:
         """The control that adapts Nerfstudio's viewer to the recording. The viewer finds it among the attributes of the
         pipeline."""
         if self._viewer is None:

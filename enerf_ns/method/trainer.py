@@ -68,6 +68,7 @@ from enerf_ns.method.guarded_steps import (
 )
 from enerf_ns.method.model import EnerfModel
 from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
+from enerf_ns.method.origin import ORIGIN_FILE, origin
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
 from enerf_ns.method.throughput import batch_factor
@@ -302,7 +303,7 @@ class EnerfTrainerConfig(TrainerConfig):
         """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Prints the recording and the choices for it, and stores config.yml, choices.json and choices.txt."""
+        """Prints the recording and the choices for it, and stores config, choices and origin of the run."""
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
@@ -320,6 +321,7 @@ class EnerfTrainerConfig(TrainerConfig):
             files = {
                 "config.yml": yaml.dump(config),
                 "choices.json": json.dumps([asdict(choice) for choice in resolution.choices], indent=2),
+                ORIGIN_FILE: json.dumps(origin(), indent=2),
                 CHOICES_FILE: choices_text(resolution.choices, CHOICES_COLUMNS),
             }
             try:

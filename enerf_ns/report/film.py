@@ -30,6 +30,8 @@ from enerf_ns.method.pipeline import EnerfPipeline
 
 VIDEO_SIDE, MOVING_SIDE = 480, 240
 """Least width of each picture in video.mp4, and width of each picture in moving.webp, pixels."""
+VIDEO_QUALITY, MOVING_QUALITY, PICTURE_QUALITY = 6, 40, 85
+"""Quality of video.mp4 from 0 to 10, and of moving.webp and other WebP pictures from 0 to 100."""
 MOVING_FRAMES, MOVING_MS, MOVING_PIXELS = 40, 90, 160 * 120
 """Pictures of moving.webp, milliseconds that each is shown, and most pixels of each that are rendered."""
 GAP = 8
@@ -120,12 +122,33 @@ def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None
     for time in track(times.tolist(), "Rendering the moving picture", console=CONSOLE, transient=True):
         rays = posed.rays(pixels, torch.full_like(pixels, time)).reshape((len(rows), len(columns)))
         sides = [event_picture(index, camera, time), *_sides(pipeline, screen, rays)]
-        pictures.append(Image.fromarray(_below([_scaled(side, MOVING_SIDE) for side in sides], strip)))
+        pictures.append(_below([_scaled(side, MOVING_SIDE) for side in sides], strip))
+    write_whole(output, animated(pictures))
+
+
+def animated(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
+    """An animated WebP of pictures of one size, each shown for `MOVING_MS`, over and over."""
+    first, *others = map(Image.fromarray, pictures)
     content = io.BytesIO()
-    pictures[0].save(
-        content, "webp", save_all=True, append_images=pictures[1:], duration=MOVING_MS, loop=0, quality=55, method=4
-    )
-    write_whole(output, content.getvalue())
+    first.save(
+        content, "webp", save_all=True, append_images=others, duration=MOVING_MS, loop=0, quality=MOVING_QUALITY,
+        method=4,
+    )  # fmt: skip
+    return content.getvalue()
+
+
+def poster_of(video: Path) -> bytes:
+    """The picture in the middle of a video that `render_video` made, as a WebP file."""
+    opened = cv2.VideoCapture(str(video))
+    opened.set(cv2.CAP_PROP_POS_FRAMES, opened.get(cv2.CAP_PROP_FRAME_COUNT) // 2)
+    return webp(opened.read()[1][..., ::-1])
+
+
+def webp(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
+    """A picture as a WebP file."""
+    content = io.BytesIO()
+    Image.fromarray(picture).save(content, "webp", quality=PICTURE_QUALITY)
+    return content.getvalue()
 
 
 @torch.no_grad()
@@ -193,8 +216,9 @@ def _write_mp4(file: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
     unwritten = OutputError(f"{file.parent} could not take a video; make room on the disk.")
     first = next(pictures)
     video = write_frames(
-        str(file), first.shape[1::-1], fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet"
-    )
+        str(file), first.shape[1::-1], fps=fps, codec="libx264", quality=VIDEO_QUALITY, macro_block_size=2,
+        ffmpeg_log_level="quiet",
+    )  # fmt: skip
     video.send(None)
     try:
         video.send(np.ascontiguousarray(first).tobytes())

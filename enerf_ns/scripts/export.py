@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".ply", ".glb")
 POSE_SUFFIXES = (".txt",)
 
-VOXEL_PIXELS = 1.5
-"""Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
-
 
 @dataclass
 class Export:
@@ -50,7 +47,7 @@ class Export:
 
     def main(self) -> None:
         from enerf_ns.export.scoring import simulated_scene, surface_scores
-        from enerf_ns.export.surface import fused, pixel_size, points_of, surface_views
+        from enerf_ns.export.surface import VOXEL_PIXELS, fused, pixel_size, points_of, surface_views
         from enerf_ns.method.runs import load
         from enerf_ns.report.run_files import read_run
         from enerf_ns.simulator.scene.scene_files import load_scene

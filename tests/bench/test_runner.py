@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -442,12 +441,3 @@ def test_the_command_names_no_place_of_this_machine(tmp_path: Path):
     assert Bench("slider-depth", settings).results([])["command"] == (
         "enerf bench slider-depth --data path/to/slider --budget 120s --scale 0.25 --seeds 2 --rows events"
     )
-
-
-def test_the_version_names_the_commit():
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
-    if head.returncode:
-        assert runner.code_version() == runner.enerf_ns.__version__
-    else:
-        version, _, commit = runner.code_version().partition("+")
-        assert version == runner.enerf_ns.__version__ and head.stdout.startswith(commit.removesuffix("-dirty"))

@@ -356,7 +356,7 @@ class SceneView(ViewerControl):
         points = rays.origins + rays.directions * depth
         is_known = torch.ones_like(share, dtype=torch.bool)
         if self._seen is not None:
-            beyond = self._model.config.contraction  # whether space beyond the box is rendered, too
+            beyond = bool(self._model.config.contraction)  # whether space beyond the box is rendered, too
             is_known = (share > 0.5) & self._seen.may_be_surface(points, beyond)[..., None]
             rgb = rgb / share.clamp(min=0.5)
         rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -53,6 +54,7 @@ def in_archive(name: str) -> Edit:
 
 
 def in_hdf5(path: Path, of: Callable) -> None:
+    file: Any
     with h5py.File(path, "r+") as file:
         place = "events/t" if "events" in file else "t"
         times = of(file[place][...])
@@ -70,6 +72,7 @@ def thousands_of_events(pixels: tuple[int, int], span: int) -> np.ndarray:
 
 
 def fill_hdf5(path: Path, size: tuple[int, int]) -> None:
+    file: Any
     with h5py.File(path, "r+") as file:
         group = file["events"] if "events" in file else file
         first, last = (int(group["t"][i]) for i in (0, -1))

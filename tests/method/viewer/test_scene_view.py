@@ -212,7 +212,8 @@ def test_who_is_there_before_the_scene_sees_training_to_its_end(
     """Pictures come, and the step advances, also where no view moves. Whoever ends the viewer of a run that is done has
     a run that is done. Camera paths are not kept with the recording."""
     config = small_config(recording, tmp_path)
-    config.vis, config.viewer.websocket_port, config.max_num_iterations = "viewer", free_port(), 200
+    port = free_port()
+    config.vis, config.viewer.websocket_port, config.max_num_iterations = "viewer", port, 200
     config.viewer.quit_on_train_completion = False
     clients: list[Client] = []
 
@@ -220,8 +221,8 @@ def test_who_is_there_before_the_scene_sees_training_to_its_end(
         return [message["updates"].get("markdown", "") for message in clients[0].told("GuiUpdateMessage")]
 
     def come() -> None:
-        wait_for(lambda: reachable(config.viewer.websocket_port))
-        clients.append(Client(config.viewer.websocket_port))
+        wait_for(lambda: reachable(port))
+        clients.append(Client(port))
         try:
             wait_for(lambda: any("has ended at step 199" in text for text in said()))
             wait_for(lambda: any("Step: 199 " in text for text in said()))
