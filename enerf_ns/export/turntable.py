@@ -44,7 +44,8 @@ def turntable(
     tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(tensor(np.asarray(mesh.vertices, np.float32)), tensor(np.asarray(mesh.faces, np.uint32)))
-    colours = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3][mesh.faces]
+    visual: Any = mesh.visual
+    colours = np.asarray(visual.vertex_colors, np.float32)[:, :3][mesh.faces]
     middle = np.asarray(mesh.vertices).mean(axis=0)
     distance = PULLED_BACK * float(np.linalg.norm(middle - pose[:, 3]))
     height = round(SIDE * camera.height / camera.width)

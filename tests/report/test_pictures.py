@@ -106,7 +106,7 @@ def test_pictures_on_the_page_have_the_colours_of_the_figure(run: Run):
         assert picture is not None
         height, width = picture.shape[:2]
         figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="#c9ced8")
-        opacity = None if column.opacities is None else column.opacities[0]
+        opacity: Any = None if column.opacities is None else column.opacities[0]
         kept = {"cmap": column.colours, "vmin": column.limits[0], "vmax": column.limits[1]} if column.bar else {}
         figure.figimage(picture, alpha=opacity, origin="upper", **kept)
         canvas = FigureCanvasAgg(figure)
