@@ -43,7 +43,8 @@ class Page(HTMLParser):
             self.open.append(f"{tag}.{values.get('class', '')}")
 
     def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop().split(".")[0] == tag, "every tag is closed"
+        if tag not in ALONE:
+            assert self.open.pop().split(".")[0] == tag, "every tag is closed"
 
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1].split(".")[0] in ("td", "th"):

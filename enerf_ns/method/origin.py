@@ -1,4 +1,4 @@
-"""Where a run comes from: the command, version, date and machine of its training, kept in origin.json."""
+"""Origin of a run: the command, version, date and machine of its training, kept in origin.json."""
 
 from __future__ import annotations
 

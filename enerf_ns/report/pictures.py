@@ -69,7 +69,7 @@ class Column:
         if self.bar:
             low, high = self.limits
             grey, opacity = np.array(to_rgb(UNKNOWN)), np.isfinite(picture).astype(float)
-            share = (np.nan_to_num(picture, nan=low) - low) / max(high - low, 1e-12)
+            share = (np.where(np.isfinite(picture), picture, low) - low) / max(high - low, 1e-12)
             if self.opacities is not None:
                 opacity = opacity * self.opacities[number]
             colours = grey + opacity[..., None] * (colormaps[self.colours](share.clip(0, 1))[..., :3] - grey)

@@ -94,7 +94,7 @@ class Reported:
         ]
 
     def making(self) -> list[tuple[str, str]]:
-        """What the run was made with and from, by name, as far as its files state it."""
+        """Command, machine, data and assumptions of the run, by name, as far as its files state them."""
         config, choices, origin = self.files.config, self.files.choices, self.files.origin
         steps = f"{self.step:,} steps" + ("" if self.seconds is None else f", {self.seconds:,.4g} s")
         recording = "" if config.data is None else config.data.name

@@ -28,11 +28,12 @@ EVENT_SCORES = {"event_correlation": 0.9, "event_rmse": 0.5, "event_sign": 0.75}
 VERDICT = "The events are explained: the correlation is high."
 
 
-def scored(run: Run, folder: Path, scores: dict[str, float], num_frames: int) -> Path:
-    """A copy of a run with a history to its end, under the name of the folder."""
+def scored(run: Run, home: Path, scores: dict[str, float], num_frames: int) -> Path:
+    """The folder of a copy of a run, under the name of its home, with a history to its end."""
+    folder = home / "enerf" / "run"
     shutil.copytree(run.config_file.parent, folder)
     config = yaml.load(run.config_file.read_text(), Loader=yaml.Loader)
-    config.experiment_name = folder.name
+    config.experiment_name, config.output_dir = home.name, home.parent
     (folder / "config.yml").write_text(yaml.dump(config))
     for step in (1, 2):
         protocol = "log-affine-set" if num_frames else "events"
@@ -85,12 +86,12 @@ def test_the_box_states_how_a_run_was_made(run: Run, tmp_path: Path):
     assert "choices.json cannot be read as JSON" in page_of(tmp_path / "older-report").text()
 
 
-def test_the_page_of_a_run_of_events_alone_is_about_events_alone(
-    run_without_frames: Run, tmp_path: Path, short_films: None
-):
+def test_the_page_of_events_alone_is_about_events(run_without_frames: Run, tmp_path: Path, short_films: None):
     folder = scored(run_without_frames, tmp_path / "events", EVENT_SCORES, 0)
     for name, given in (("with-history", folder), ("scored-anew", run_without_frames)):
-        write_report([given], tmp_path / name)
+        (scores,) = write_report([given], tmp_path / name, video=given is folder).values()
+        assert [scores[score] for score in ("psnr", "ssim", "lpips")] == [None] * 3
+        assert scores["event_correlation"] is not None and "correlation" not in scores
         page = page_of(tmp_path / name)
         for words in (page.text("dd.command", "style."), (tmp_path / name / "report.md").read_text()):
             assert "frame" not in re.sub(r"\* command: .*", "", words).lower()
