@@ -57,8 +57,8 @@ MOST_COLUMNS = 120
 def nearest(flag: str, known: Iterable[str]) -> str | None:
     """The flag that is spelt most like another; also one whose last part is, as --lr and --optimizers.fields.lr are."""
     flags = sorted(known, key=lambda name: (name.count("."), name))
-    last = {name.strip("-").rpartition(".")[2]: name for name in reversed(flags)}
-    end = flag.strip("-").rpartition(".")[2]
+    last = {_last_part(name): name for name in reversed(flags)}
+    end = _last_part(flag)
     alike = close(flag, flags, 0.8)
     if end in last and not (alike and "." in flag):
         return last[end]
@@ -66,6 +66,10 @@ def nearest(flag: str, known: Iterable[str]) -> str | None:
         return alike
     found = close(end, last, 0.7)
     return last[found] if found else None
+
+
+def _last_part(flag: str) -> str:
+    return re.split(r"\.| ", flag)[-1].strip("-")
 
 
 def close(word: str, words: Iterable[str], likeness: float = 0.6) -> str | None:

@@ -49,7 +49,7 @@ def test_no_flag_of_tyros_own_help_is_lost(
     monkeypatch.setattr(tyros, "format_help", tyros.format_help.__wrapped__)  # type: ignore[attr-defined]
 
     def before(*arguments: str) -> set[str]:
-        found = re.findall(r"│ (?:-h, )?(--[a-z]\S*)", told(capsys, *arguments, "--help")[1])
+        found = re.findall(r"^[^\w-]*(?:-h, )?(--[a-z]\S*)", told(capsys, *arguments, "--help")[1], re.MULTILINE)
         return set(found) - {"--help"}
 
     whole = before(method)
@@ -80,7 +80,7 @@ def test_what_people_use_stands_first_and_nerfstudios_last(
 
 
 def test_help_and_errors_of_other_methods_are_those_of_tyro(capsys: pytest.CaptureFixture[str]):
-    assert "╭─ options ─" in told(capsys, "nerfacto", "--help")[1]
+    assert "[NERFACTO OPTIONS]" in told(capsys, "nerfacto", "--help")[1]
     code, _, errors = told(capsys, "nerfacto", "--max-num-iteration", "5")
     assert code == 2 and "Perhaps you meant" in errors and "--max-num-iterations" in errors
 
@@ -95,7 +95,7 @@ def test_a_tyro_that_is_built_otherwise_speaks_for_itself(
 
     monkeypatch.setattr("enerf_ns.flags._entry", moved)
     monkeypatch.setattr("enerf_ns.flags._sub_commands", moved)
-    assert "╭─ options ─" in told(capsys, "enerf", "--help")[1]
+    assert "[ENERF OPTIONS]" in told(capsys, "enerf", "--help")[1]
     assert "Perhaps you meant" in told(capsys, "enerf", "--max-num-iteration", "5")[2]
 
 

@@ -125,7 +125,7 @@ class Resolution:
     selection: tuple[str, ...] = ()
     """Notes about the preset, one sentence each."""
     summary: tuple[str, ...] = ()
-    """What the field learns from, what is assumed, and what is learned beside it, one sentence each."""
+    """Sentences on the data that the field learns from, on what is assumed, and on what is learned beside it."""
     flags_to_state: tuple[str, ...] = ()
     """Flags of `ns-train` that state what the recording does not."""
     cause: str = ""

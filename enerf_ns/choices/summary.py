@@ -14,8 +14,8 @@ MOST_FLAGS = 3
 
 
 def in_words(scene: Scene) -> tuple[str, ...]:
-    """What the field learns from, what is assumed, and what is learned beside it: a few sentences. What limits the
-    result most stands first.
+    """Sentences on the data that the field learns from, on what is assumed, and on what is learned beside it. What
+    limits the result most stands first.
 
     Args:
         scene: In which all rows have been decided.
@@ -56,7 +56,7 @@ def _assumes_level(scene: Scene) -> bool:
 
 
 def _limits(scene: Scene) -> str:
-    """What the recording does not tell, and what follows from it."""
+    """Facts that the recording does not hold, and their effect."""
     known = [] if _holds_frames(scene) else ["the recording holds no frames"]
     if _assumes_threshold(scene):
         mean = 0.5 * sum(scene.once(chosen_thresholds).values)

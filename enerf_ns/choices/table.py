@@ -1,4 +1,4 @@
-"""What training prints of the recording, the choices, and the errors of clock, poses and lens."""
+"""Output of training on the recording, the choices, and the errors of clock, poses and lens."""
 
 from __future__ import annotations
 

