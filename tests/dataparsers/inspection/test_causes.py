@@ -42,8 +42,12 @@ FAULTS = pytest.mark.parametrize(
         pytest.param(faults.scalar_first, "quaternions in the order w x y z", "move the first number", id="w x y z"),
         pytest.param(faults.opengl, "OpenGL's camera axes", "from the right by diag(1, -1, -1)", id="OpenGL"),
         pytest.param(lambda read: faults.mirrored(read, 1), "mirrored axes", "M = diag(1, -1, 1)", id="mirrored"),
-        pytest.param(lambda read: faults.poses_late(read, 23), "the clocks disagree by 2", "ms off the times", id="late"),
-        pytest.param(lambda read: faults.longer_focal_length(read, 2.0), "focal length is wrong", "fx and fy", id="lens"),
+        pytest.param(
+            lambda read: faults.poses_late(read, 23), "the clocks disagree by 2", "ms off the times", id="late"
+        ),
+        pytest.param(
+            lambda read: faults.longer_focal_length(read, 2.0), "focal length is wrong", "fx and fy", id="lens"
+        ),
     ],
 )
 
