@@ -1,4 +1,4 @@
-"""What to do with a recording that a command has written."""
+"""Commands for a recording that a command has written."""
 
 from __future__ import annotations
 
