@@ -95,7 +95,7 @@ def test_the_page_of_events_alone_is_about_events(run_without_frames: Run, tmp_p
         page = page_of(tmp_path / name)
         for words in (page.text("dd.command", "style."), (tmp_path / name / "report.md").read_text()):
             assert "frame" not in re.sub(r"\* command: .*", "", words).lower()
-        assert "-" not in page.cells and "none at this time" not in page.text()
+        assert "-" not in page.rows[1] and "none at this time" not in page.text()
         assert "mean threshold assumed: brightness is known up to scale" in page.text().lower()
         assert "The square is the share of their variance that is explained" in "".join(page.unfolded())
 
