@@ -51,7 +51,8 @@ _ENCODING = "nerfstudio.field_components.encodings:HashEncoding"
 SEAMS = (
     # private methods that are overridden
     Seam(f"{_TRAINER}._after_train", "method.trainer ends an interrupted run here, and prints the end", ("self",)),
-    Seam(f"{_TRAINER}._train_complete_viewer", "method.trainer lets Ctrl-C end the viewer after training"),
+    Seam(f"{_TRAINER}._train_complete_viewer", "method.trainer waits later, after its last lines"),
+    Seam(f"{_TRAINER}._update_viewer_state", "method.trainer lets the viewer look at the step by itself"),
     Seam(
         "nerfstudio.data.dataparsers.base_dataparser:DataParser._generate_dataparser_outputs",
         "dataparsers.event_dataparser makes the outputs of a recording",
@@ -62,8 +63,13 @@ SEAMS = (
         "method.viewer.scene_view starts here; the viewer finds it among the attributes of the pipeline",
         ("self", "viewer"),
     ),
-    Seam(f"{_RENDERER}._render_img", "method.viewer.view_renderer renders a view", ("self", "camera_state")),
-    Seam(f"{_RENDERER}._calculate_image_res", "method.viewer.view_renderer chooses the size", ("self", "aspect_ratio")),
+    Seam(f"{_RENDERER}.run", "method.viewer.view_renderer renders in a loop of its own", ("self",)),
+    Seam(f"{_RENDERER}.action", "method.viewer.view_renderer takes note of moves", ("self", "action")),
+    Seam(
+        f"{_RENDERER}._send_output_to_viewer",
+        "method.viewer.view_renderer sends a picture",
+        ("self", "outputs", "static_render"),
+    ),
     # public methods that are overridden, and that Nerfstudio's commands call for something else
     Seam(f"{_EXPERIMENT}.save_config", "method.trainer resolves the config and prints its tables here", ("self",)),
     Seam(f"{_EXPERIMENT}.print_to_terminal", "method.trainer prints nothing here", ("self",)),
@@ -101,12 +107,13 @@ SEAMS = (
     Seam(f"{_SAMPLERS}:PDFSampler.histogram_padding", "rendering.ray_samplers pads weights as Nerfstudio does"),
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn", "rendering.ray_samplers spaces samples as Nerfstudio does"),
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn_inv", "rendering.ray_samplers spaces samples as Nerfstudio does"),
-    *(
-        Seam(f"{_RENDERER}.{name}", "method.viewer.view_renderer")
-        for name in ("transitions", "state", "interrupt_render_flag", "check_interrupt")
-    ),
+    *(Seam(f"{_RENDERER}.{name}", "method.viewer.view_renderer") for name in ("check_interrupt", "client")),
     *(Seam(f"{_RENDERER}.{name}", "replace_renderer") for name in ("running", "render_trigger")),
-    Seam("nerfstudio.viewer_legacy.server.viewer_utils:SetTrace", "method.viewer.view_renderer interrupts a render"),
+    *(
+        Seam(f"nerfstudio.viewer_legacy.server.viewer_utils:{name}", "method.viewer.view_renderer interrupts a render")
+        for name in ("SetTrace", "IOChangeException")
+    ),
+    Seam("nerfstudio.viewer.viewer:Viewer.make_stats_markdown", "method.viewer.view_renderer says the step"),
     Seam("nerfstudio.viewer.viewer:Viewer.render_statemachines", "replace_renderer, method.viewer.scene_view"),
     *(
         Seam(f"nerfstudio.viewer.viewer:Viewer.{name}", "method.viewer.scene_view")

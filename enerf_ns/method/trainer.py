@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
+import time
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
@@ -550,10 +552,34 @@ class EnerfTrainer(Trainer):
         self._interrupted = self.stop_training = True
         say("Training is interrupted. It finishes this step and stores a checkpoint; a second signal stops it at once.")
 
+    def _update_viewer_state(self, step: int) -> None:
+        if isinstance(self.viewer_state, Viewer):
+            self.pipeline.viewer.after_step(step)
+        else:
+            super()._update_viewer_state(step)
+
     def _train_complete_viewer(self) -> None:
-        self._restore_signals()
-        with suppress(KeyboardInterrupt):  # which ends the viewer
-            super()._train_complete_viewer()
+        """Does nothing: Nerfstudio would wait here, before the last lines; `_end_viewer` waits after them."""
+
+    def _end_viewer(self, how: str) -> None:
+        """Says in the browser how training ended. After the last step, the viewer stays until Ctrl-C if the flag says
+        so, or if a browser shows it and the command runs on a terminal."""
+        viewer = self.viewer_state
+        if not isinstance(viewer, Viewer):
+            return
+        looked_at = bool(viewer.viser_server.get_clients())
+        at_terminal = looked_at and CONSOLE.is_terminal and sys.stdin.isatty()
+        stays = not self._interrupted and (at_terminal or not self.config.viewer.quit_on_train_completion)
+        config = quoted(self.base_dir / "config.yml")
+        show = "" if stays else f" `ns-viewer --load-config {config}` shows the run again."
+        self.pipeline.viewer.end(self._trained, f"**Training {how} at step {self._trained}.**{show}")
+        if stays:
+            say("The viewer stays until Ctrl-C.")
+            with suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(1.0)
+        elif looked_at:
+            time.sleep(0.5)  # in which viser sends the sentence
 
     def _after_train(self) -> None:
         self.step = self._trained  # Nerfstudio has counted one step more where training was stopped
@@ -565,6 +591,7 @@ class EnerfTrainer(Trainer):
             clear_line()
             self._say_skipped()
             say_where("continue", f"ns-train {self.config.method_name} --load-config {config}")
+            self._end_viewer("was interrupted")
             raise SystemExit(130)
         with without_chatter():
             super()._after_train()
@@ -585,6 +612,7 @@ class EnerfTrainer(Trainer):
             "viewer": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)
+        self._end_viewer("has ended")
 
     def _say_poses(self) -> None:
         """Prints the errors that were found in clock, poses and lens, and stores them with the run."""
