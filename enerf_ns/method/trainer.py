@@ -344,7 +344,7 @@ class EnerfTrainer(Trainer):
     @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         config = self.config
-        with without_chatter():
+        with without_chatter(), self.train_lock:  # a browser may be there before the checkpoint
             super().setup(test_mode)
         self.pipeline.num_steps = config.max_num_iterations
         self.error_against_time = ErrorAgainstTime(
@@ -434,7 +434,8 @@ class EnerfTrainer(Trainer):
         config.max_num_iterations = total - self._start_step  # Nerfstudio counts from the step of the checkpoint
         try:
             if is_main_process():
-                self.error_against_time.begin(self._start_step, self._recorded)
+                with self.train_lock:  # else a picture that is rendered meanwhile would be one of training
+                    self.error_against_time.begin(self._start_step, self._recorded)
             super().train()
         except OSError as error:  # from files that Nerfstudio writes beside checkpoints, such as TensorBoard's
             raise SystemExit(
