@@ -393,7 +393,7 @@ def test_a_browser_sees_training_from_before_its_first_step_and_the_run_afterwar
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [tool("ns-train"), "enerf", "--data", data, "--output-dir", tmp_path / "runs", "--timestamp", "run",
-         "--max-num-iterations", "300", "--evaluation-share", "0", "--machine.device-type", "cpu",
+         "--max-num-iterations", "200", "--evaluation-share", "0", "--machine.device-type", "cpu",
          "--viewer.websocket-port", str(port)],
         stdin=theirs, stdout=theirs, stderr=theirs,
     )  # fmt: skip
@@ -404,8 +404,8 @@ def test_a_browser_sees_training_from_before_its_first_step_and_the_run_afterwar
         assert process.poll() is None, b"".join(printed)[-2000:]
         browser.call("Page.navigate", url=page)
         wait_for(lambda: re.search(r"Step: [1-9]\d*\s+Resolution: [1-9]", browser.text()), 240.0)
-        wait_for(lambda: "Training has ended at step 299" in browser.text(), 240.0)
-        wait_for(lambda: number.findall(browser.text()) == ["299"])
+        wait_for(lambda: "Training has ended at step 199" in browser.text(), 240.0)
+        wait_for(lambda: number.findall(browser.text()) == ["199"])
         after_training = shown()
         wait_for(lambda: b"stays until Ctrl-C" in b"".join(printed))
         process.send_signal(signal.SIGINT)
@@ -419,7 +419,7 @@ def test_a_browser_sees_training_from_before_its_first_step_and_the_run_afterwar
             )  # fmt: skip
         wait_for(lambda: process.poll() is not None or reachable(port))
         browser.call("Page.navigate", url=page)
-        wait_for(lambda: number.findall(browser.text()) == ["299"])
+        wait_for(lambda: number.findall(browser.text()) == ["199"])
         after_loading = shown()
     finally:
         browser.close()
@@ -431,7 +431,6 @@ def test_a_browser_sees_training_from_before_its_first_step_and_the_run_afterwar
         Image.fromarray(picture).save(tmp_path / f"{name}.png")
         grey = cv2.resize(picture.mean(-1), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         found = likeness(grey, frame)
-        print(name, found)
         assert found > 0.4, "cameras and trajectory are drawn over it"
     assert max(likeness(grey, frame[::-1]), likeness(grey, frame[:, ::-1])) < found - 0.1
 
