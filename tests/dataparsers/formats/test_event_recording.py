@@ -484,8 +484,8 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "t is text": (put("events/t.npy", "0 1 2"), "events/t.npy cannot be read as a NumPy array"),
     "t in float seconds": (
         save("events/t.npy", EVENTS[:, 2] * 1e-9),
-        "events holds t.npy as float64 of shape (6,), but one whole number for each event (t in ns) was expected; save "
-        "it with .astype(np.int64)",
+        "events holds t.npy as float64 of shape (6,), but one whole number for each event (t in nanoseconds) was "
+        "expected; save it with .astype(np.int64)",
     ),
     "x float": (save("events/x.npy", EVENTS[:, 0] * 1.0), "save it with .astype(np.uint16)"),
     "y float16": (save("events/y.npy", EVENTS[:, 1].astype(np.float16)), "holds y.npy as float16"),

@@ -585,7 +585,6 @@ BAD_RAW = {
     ),
     "no poses": (remove(f"{DATA}/mocap_data.txt"), DATA, "*mocap*.txt", "t_us px py pz qx qy qz qw"),
     "poses in seconds": (scale_times(f"{DATA}/mocap_data.txt", 1e-6), "mocap_data.txt", "microseconds"),
-    "poses in nanoseconds": (scale_times(f"{DATA}/mocap_data.txt", 1e3), "mocap_data.txt", "microseconds"),
     "a quaternion off norm in the poses": (
         write(f"{DATA}/mocap_data.txt", "0 0 0 0 0 0 0 1\n8333 0 0 0 0 0 0 2\n"),
         "mocap_data.txt, line 2",

@@ -83,7 +83,7 @@ def changed_events(change: str) -> np.ndarray:
     if change == "unused pixels":
         events[:, 0] = events[:, 0] * (30 - events[:, 1]) // 45
     if change == "cropped":
-        events = events[events[:, 0] < 20]
+        events = events[events[:, 0] < 28]
     if change == "exchanged":
         events = events[events[:, 0] < CAMERA.height]
     if change == "few events":
@@ -145,7 +145,7 @@ PROBLEMS = {
     "unused pixels": (dict(events=changed_events("unused pixels")), r"[56]\d % of the pixels have fewer", "two events"),
     "cropped": (
         dict(events=changed_events("cropped")),
-        r"No event has x above 19, though .*: the sensor seems to be cropped", "cx and cy less its first column",
+        r"No event has x above 27, though .*: the sensor seems to be cropped", "cx and cy less its first column",
     ),
     "exchanged": (
         dict(events=changed_events("exchanged")),
