@@ -46,6 +46,7 @@ def test_no_flag_of_tyros_own_help_is_lost(
     own = [flag for flags in ours.values() for flag in flags]
     assert len(set(own)) == len(own)
     of_recording = {flag.removeprefix(f"{RECORDING} ") for flag in own if " " in flag}
+    monkeypatch.setenv("COLUMNS", "79")  # in which tyro draws one column of boxes
     monkeypatch.setattr(tyros, "format_help", tyros.format_help.__wrapped__)  # type: ignore[attr-defined]
 
     def before(*arguments: str) -> set[str]:

@@ -385,7 +385,7 @@ class Agreement:
             )
 
     def _mend_of_readings(self) -> str:
-        """What to do if another reading of the poses than the one in which they were read fits the events."""
+        """The advice if the events contradict the reading in which the poses were read."""
         likeliest, *others = self.readings
         fault = likeliest.fault_of_events and f"if the poses are right, {likeliest.fault_of_events}"
         if others:

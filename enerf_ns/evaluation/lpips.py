@@ -109,7 +109,7 @@ def fetch_weights(net: Net) -> Path:
             file.unlink()
         except FileNotFoundError:
             pass
-        published.get_state_dict(progress=True, check_hash=True)
+        torch.hub.load_state_dict_from_url(published.url, str(file.parent), check_hash=True)
     except BrokenPipeError:
         raise
     except (OSError, HTTPException, RuntimeError) as error:

@@ -420,7 +420,7 @@ class EnerfPipeline(VanillaPipeline):
         not_scored: Any = scores.pop("not_scored", {})
         for name, reasons in not_scored.items():
             if protocol == EVENTS_PROTOCOL and name not in EVENT_SCORES:
-                continue  # the description of the protocol says that there are no frames
+                continue  # the protocol, which is printed, needs no frames
             for reason, numbers in reasons.items():
                 of = f" of {len(numbers)} of {len(views)} frames ({', '.join(map(str, numbers))})" if numbers else ""
                 CONSOLE.print(f"No {name}{of}: {reason}.", soft_wrap=True, highlight=False, markup=False)

@@ -57,7 +57,7 @@ def test_what_limits_the_result_stands_first(bare: Path, tmp_path: Path):
 
 def test_what_is_learned_beside_the_field_is_named(bare: Path, tmp_path: Path):
     learned = told(bare, tmp_path, sensor__learn_leak_rate=True, sensor__learn_cutoff_frequency=True).summary[-1]
-    assert learned.startswith("Training also learns the cutoff frequency and leak rate.")
+    assert learned.startswith("Training also learns the leak rate and cutoff frequency.")
     assert "Training corrects clock, mount, lens and drift of the poses if events show that they are wrong." in learned
 
 

@@ -354,7 +354,7 @@ def test_the_end_of_a_run_is_told_by_its_history_as_by_its_checkpoint(
     (by_history,) = write_report([run], tmp_path / "history", video=False).values()
     (run.config_file.parent / "history.jsonl").unlink()
     (by_checkpoint,) = write_report([run], tmp_path / "checkpoint", video=False).values()
-    of_events = set(EVENT_SCORES)  # which the end of a run has beside those of frames
+    of_events = {*EVENT_SCORES, "verdict"}  # which the end of a run has beside the scores of frames
     assert set(by_history) - of_events == set(by_checkpoint)
     for name in set(by_checkpoint) - {"fps", "num_rays_per_sec", "train_seconds", "not_scored"}:
         value = by_checkpoint[name]

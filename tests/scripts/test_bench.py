@@ -44,7 +44,8 @@ def test_each_training_the_table_and_where_it_lies_are_printed(call, tmp_path: P
         "[1/2] recording, events, seed 0: The method enerf has no setting pipeline.model.nothing"
     )
     assert any(line.startswith("│ recording │ events │") for line in lines)
-    assert f"The table is in {tmp_path / 'left-out'}.md, .json and .csv" == lines[-1]
+    assert f"The table is in {tmp_path / 'left-out'}.md, .json and .csv" == lines[-2]
+    assert lines[-1].endswith(f"enerf bench left-out --against {tmp_path / 'left-out.json'}")
     assert {file.name for file in tmp_path.glob("left-out.*")} == {"left-out.md", "left-out.json", "left-out.csv"}
 
 

@@ -425,7 +425,7 @@ def test_the_viewer_answers(run: Path, tmp_path: Path):
 def test_eval_without_frames(call, run_without_frames: Path, capsys: pytest.CaptureFixture[str]):
     call("ns-eval", "--load-config", run_without_frames, "--output-path", "scores.json")
     printed = capsys.readouterr().out
-    assert "Protocol events: there are no frames." in printed and "\nNo " not in printed
+    assert "Protocol events: Rendered changes of log brightness are compared" in printed and "\nNo " not in printed
     scores = json.loads(Path("scores.json").read_text())["results"]
     assert "psnr" not in scores, "a picture of events is no frame to compare with"
     assert -1.0 <= scores["event_correlation"] <= 1.0
