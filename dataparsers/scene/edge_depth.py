@@ -37,8 +37,8 @@ RADIUS = 4
 SMOOTHING = (0.12, 0.76, 0.12)
 """Weights by which votes are smoothed along each axis, since a vote falls on one whole pixel."""
 
-MIN_RIDGE = 1.2
-"""Fewest votes of the pixel of an edge, as a multiple of the mean of its square."""
+MIN_RIDGE = 0.7
+"""Fewest votes of the pixel of an edge, in standard deviations above the mean of its square."""
 
 MIN_CONFIDENCE = 3.0
 """Smallest contrast at the best plane, as a multiple of the mean over all planes."""
@@ -169,8 +169,8 @@ def _sweep(lines, disparities, rows, columns, radius, weights):
     """Finds, for each pixel, the plane at which the contrast of the votes around it is largest.
 
     Returns:
-        The plane, refined by a parabola; the contrast there; the mean contrast over the planes; and the votes there as
-        a multiple of the mean of the square.
+        The plane, refined by a parabola; the contrast there; the mean contrast over the planes; and the votes there, in
+        standard deviations above the mean of the square.
     """
     plane, total, best, ridge, before, last = np.zeros((6, rows, columns), np.float32)
     best[:] = -1.0
@@ -214,7 +214,7 @@ def _sweep(lines, disparities, rows, columns, radius, weights):
                 total[y, x] += contrast
                 if contrast > best[y, x]:
                     best[y, x], before[y, x], plane[y, x] = contrast, last[y, x], p
-                    ridge[y, x] = smooth[y + margin, x + margin] / (mean + small)
+                    ridge[y, x] = (smooth[y + margin, x + margin] - mean) / np.sqrt(contrast + small)
                 elif plane[y, x] == p - 1 and p > 1:
                     bend = before[y, x] - 2 * best[y, x] + contrast
                     if bend < 0:
@@ -230,7 +230,9 @@ def _confirmed(views: Sequence[EdgeView]) -> list[EdgeView]:
     confirmed = []
     for i, view in enumerate(views):
         neighbours = [*views[max(i - NUM_NEIGHBOURS, 0) : i], *views[i + 1 : i + 1 + NUM_NEIGHBOURS]]
-        confirmations = sum((_confirmed_by(neighbour, view) for neighbour in neighbours), np.zeros(view.depth.shape, int))
+        confirmations = sum(
+            (_confirmed_by(neighbour, view) for neighbour in neighbours), np.zeros(view.depth.shape, int)
+        )
         confirmed.append(view._keep(confirmations >= min(MIN_CONFIRMATIONS, len(neighbours))))
     return confirmed
 
