@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import Annotated, Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import numpy as np
 import torch
@@ -27,12 +29,12 @@ from tyro.conf import Suppress
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.index.picture_files import write_pictures
+from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 with warnings.catch_warnings(), suppress(ImportError):  # hides two warnings that Nerfstudio would show at each start
@@ -126,6 +128,7 @@ class EventDataParser(DataParser):
                     f"with ns-train enerf --data {quoted(recording.path)}, or make frames from events with enerf "
                     f"reconstruct {quoted(recording.path)} --output-dir NEW and give that folder."
                 )
+            go_on_without_lpips()
             return with_picture_files(self.outputs(recording, split))
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
@@ -142,7 +145,7 @@ class EventDataParser(DataParser):
             RecordingError: The depth range is neither stated nor measurable, or all frames lie in gaps of the poses.
             FlagError: The frames cannot be downscaled by this factor.
         """
-        near, far = scene_depth_range(recording, self.config.depth_range)
+        near, far = depth_range_or_cause(recording, self.config.depth_range)
         transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
         frames, are_frames = split_frames(recording, self.config, held_out=split != "train")
 
@@ -198,6 +201,28 @@ class EventDataparserOutputs(DataparserOutputs):
         """
         values = {"transform": self.dataparser_transform.tolist(), "scale": float(self.dataparser_scale)}
         write_whole(path, json.dumps(values, indent=4))
+
+
+@cache
+def go_on_without_lpips() -> None:
+    """Lets a method of Nerfstudio start where the weights of its LPIPS cannot be downloaded. The score is nan then.
+
+    These methods make an LPIPS of AlexNet when they start, and torchvision downloads its weights at that time.
+    """
+    from torchvision.models import AlexNet_Weights, alexnet
+
+    downloaded = AlexNet_Weights.get_state_dict
+
+    def state(weights: AlexNet_Weights, *arguments: Any, **options: Any) -> Mapping[str, Any]:
+        try:
+            return downloaded(weights, *arguments, **options)
+        except OSError:
+            print("lpips is left out (nan): its weights cannot be downloaded; get them by enerf fetch-lpips alex.")
+            with torch.device("meta"):
+                layers = alexnet(weights=None).state_dict()
+            return {name: torch.tensor(torch.nan).expand(layer.shape) for name, layer in layers.items()}
+
+    AlexNet_Weights.get_state_dict = state  # type: ignore
 
 
 def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:

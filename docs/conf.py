@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
-import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 project = "enerf-ns"
 author = "The enerf-ns developers"
@@ -32,18 +33,21 @@ COMMANDS_PAGE = Path(__file__).with_name("commands.md")
 
 def write_commands(app: Any) -> None:
     """Writes the page of all commands and their flags from the output of `--help` of each command."""
-    from enerf_ns.scripts.cli import COMMANDS
+    from nerfstudio.scripts import train
 
-    programs = {f"enerf {name}": ["enerf", name] for name in COMMANDS} | {"ns-train enerf": ["ns-train", "enerf"]}
-    environment = {**os.environ, "COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
+    from enerf_ns.scripts import cli
 
-    def help_of(program: list[str]) -> str:
-        path = Path(sys.executable).with_name(program[0])
-        command = [path, *program[1:], "--help"]
-        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        texts = list(pool.map(help_of, programs.values()))
+    programs = {f"enerf {name}": cli.entrypoint for name in cli.COMMANDS} | {"ns-train enerf": train.entrypoint}
+    texts = []
+    for program, entrypoint in programs.items():  # in this process, since starting each would take seconds of imports
+        printed = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
+        environment = {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
+        with patch.dict(os.environ, environment), patch.object(sys, "argv", [*program.split(), "--help"]):
+            with redirect_stdout(printed), suppress(SystemExit):
+                entrypoint()
+        printed.seek(0)
+        texts.append(printed.read())
+        assert texts[-1], f"{program} --help prints nothing"
     sections = [f"## {name}\n\n```text\n{text.strip()}\n```" for name, text in zip(programs, texts, strict=True)]
     head = (
         "# Commands and flags\n\nThe output of `--help` of each command. [Training](training.md) lists the flags of "

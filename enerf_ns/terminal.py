@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import shutil
+import textwrap
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
+import rich
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import RenderableType
 from rich.control import Control
 from rich.panel import Panel
 from rich.segment import ControlType
@@ -54,6 +57,22 @@ def say(sentence: str) -> None:
     CONSOLE.print(Text(printable(sentence), "yellow"), soft_wrap=True)
 
 
+def columns() -> int:
+    """Width of what is printed: that of the terminal, of 80 columns for a file, and at most that of `CONSOLE`."""
+    return min(shutil.get_terminal_size().columns, CONSOLE.width)
+
+
+def say_table(table: RenderableType) -> None:
+    """Prints a table or a rule in the width of the terminal."""
+    CONSOLE.print(table, width=columns())
+
+
+def say_plainly(text: str) -> None:
+    """Prints sentences in the width of the terminal. No word is broken, so that flags can be copied."""
+    lines = textwrap.wrap(printable(text), columns(), break_long_words=False, break_on_hyphens=False)
+    CONSOLE.print(Text("\n".join(lines)), soft_wrap=True)
+
+
 def say_where(what: str, where: str) -> None:
     """Prints a path or a command on one line of any length, so that it can be copied. Its paths must be `quoted`."""
     CONSOLE.print(Text.assemble((f"{what}:", "bold"), f" {where}"), soft_wrap=True)
@@ -73,21 +92,26 @@ CHATTER = (
 )
 """Beginnings of lines of Nerfstudio that do not help the user, or that fail on paths with brackets."""
 
+BOXES = ("Training Finished", "viser")
+"""Titles of boxes of Nerfstudio and viser."""
+
 
 @contextmanager
 def without_chatter() -> Iterator[None]:
-    """Suppresses `CHATTER` and the box at the end of Nerfstudio's training, because our output has its paths."""
+    """Suppresses `CHATTER`, and `BOXES`, which hold what our output has, too."""
 
     def without(say: Callable[..., None]) -> Callable[..., None]:
         def said(*objects: Any, **options: Any) -> None:
             first = objects[0] if objects else None
-            ends = isinstance(first, Panel) and "Training Finished" in str(first.title)
-            if not ends and not (isinstance(first, str) and first.startswith(CHATTER)):
+            is_box = isinstance(first, Panel) and any(title in str(first.title) for title in BOXES)
+            if not is_box and not (isinstance(first, str) and first.startswith(CHATTER)):
                 say(*objects, **options)
 
         return said
 
-    with patch.object(CONSOLE, "print", without(CONSOLE.print)), patch.object(CONSOLE, "log", without(CONSOLE.log)):
+    with ExitStack() as patches:
+        for owner, name in ((CONSOLE, "print"), (CONSOLE, "log"), (rich, "print")):
+            patches.enter_context(patch.object(owner, name, without(getattr(owner, name))))
         yield
 
 

@@ -1,7 +1,7 @@
 """Commands that are killed at random moments, or whose disk is full, in processes of their own; checks what they leave.
 
 A program of its own, with one thread, since its processes are forked: each would take seconds to start otherwise. Says,
-as JSON, how often each command was broken off.
+as JSON, how often each command was broken off in each way.
 """
 
 from __future__ import annotations
@@ -423,38 +423,43 @@ def small_disk(job: Job, share: float) -> Iterator[Callable[[], None]]:
         subprocess.run(["umount", "--lazy", disk], check=True)
 
 
-def broken_off(job: Job, how: str, kills: int) -> int:
-    """How often a job was broken off; runs it once before, so that what is imported and compiled is there already in
-    the processes that are forked."""
+def broken_off(job: Job, ways: list[str], kills: int) -> list[int]:
+    """How often a job was broken off in each way; runs it once before, so that what is imported and compiled is there
+    already in the processes that are forked."""
     job.prepare()
     if isinstance(job, Train | Checkpoint):  # whose gradients start threads, which no fork has
         assert child(lambda: job.run(job.reference))[0] == 0
     else:
         job.run(job.reference)
-    job.begin_anew(False)
-    if how == "kill":
-        return killed(job, kills, random.Random(0))
-    return full(job, small_files if how == "small-files" else small_disk)
+    numbers = []
+    for way in ways:
+        job.begin_anew(True)
+        if way == "kill":
+            numbers.append(killed(job, kills, random.Random(0)))
+        else:
+            numbers.append(full(job, small_files if way == "small-files" else small_disk))
+    return numbers
 
 
-def main(how: str, recording: Path, folder: Path, kills: int) -> None:
-    numbers = {}
+def main(recording: Path, folder: Path, kills: int, ways: list[str]) -> None:
+    numbers: dict[str, dict[str, int]] = {way: {} for way in ways}
     for kind in JOBS:
         job, (reader, number) = kind(recording, folder), os.pipe()
         process = os.fork()
         if not process:
             code = 1
             try:
-                os.write(number, str(broken_off(job, how, kills)).encode())
+                os.write(number, json.dumps(broken_off(job, ways, kills)).encode())
                 code = 0
             except BaseException:
                 traceback.print_exc()
             finally:
                 os._exit(code)
         assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0, job.name
-        numbers[job.name] = int(os.read(reader, 100))
+        for way, found in zip(ways, json.loads(os.read(reader, 100)), strict=True):
+            numbers[way][job.name] = found
     print(json.dumps(numbers))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])

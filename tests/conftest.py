@@ -6,14 +6,19 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from warm_commands import WarmCommands
 
+if TYPE_CHECKING:
+    from enerf_ns.method.runs import Run
+
 # without a GPU, kernels of Triton run as NumPy; Triton reads this when it is imported
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
+torch.set_warn_always(True)  # else a warning of PyTorch is raised at its first place alone, and filters miss the others
 
 SWEEP_SEED = "ENERF_SWEEP_SEED"
 
@@ -51,15 +56,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def not_drawn(items: list[pytest.Item], seed: int) -> set[pytest.Item]:
-    """Returns the cases of sweeps that are not run: all but as many as the marker of each test says."""
+    """Returns the cases of sweeps that are not run: all but as many as the marker of each test says, besides those that
+    are marked exhaustive. Tests whose marker has the same name are one sweep."""
     sweeps: dict[tuple[str, int], list[pytest.Item]] = defaultdict(list)
     for item in items:
-        if marker := item.get_closest_marker("sweep"):
-            sweeps[item.nodeid.partition("[")[0], marker.args[0]].append(item)
+        if (marker := item.get_closest_marker("sweep")) and "exhaustive" not in item.keywords:
+            number, name = marker.args[0], (*marker.args, item.nodeid.partition("[")[0])[1]
+            sweeps[name, number].append(item)
     return {
         item
-        for (test, number), cases in sweeps.items()
-        for item in random.Random(f"{seed} {test}").sample(cases, max(len(cases) - number, 0))
+        for (name, number), cases in sweeps.items()
+        for item in random.Random(f"{seed} {name}").sample(cases, max(len(cases) - number, 0))
     }
 
 
@@ -128,3 +135,27 @@ def colour_recording(recording: Path) -> Path:
     for file in [*folder.glob("images/*.png"), *folder.glob("images_corrupted/*.png")]:
         Image.fromarray((load_image(file) * np.array([1.0, 0.8, 0.5])).astype(np.uint8)).save(file)
     return folder
+
+
+@pytest.fixture(scope="session")
+def run(recording: Path) -> Run:
+    """Of two steps on that recording."""
+    from small_runs import SMALL
+
+    from enerf_ns.method.runs import method_config, train
+
+    return train(method_config("enerf", recording, recording.parent / "runs", SMALL))
+
+
+@pytest.fixture(scope="session")
+def run_without_frames(recording: Path) -> Run:
+    """The same of events alone."""
+    from small_runs import SMALL
+
+    from enerf_ns.method.runs import method_config, train
+
+    folder = recording.with_name("without_frames")
+    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
+    changes = {**SMALL, "pipeline.datamanager.dataparser.held_out_every": 16}
+    changes["pipeline.datamanager.held_out_events"] = 0.2  # of so few events
+    return train(method_config("enerf", folder, recording.parent / "runs", changes))

@@ -1,14 +1,15 @@
 """The program of `WarmCommands`: it forks processes of commands, and has imported all that they import.
 
-Each line that it reads is a command as JSON: `program` (enerf or ns-train), `arguments`, `folder`, `environment`,
-`output` (the file that it prints into) and `limit` (seconds, after which it is killed). It answers each with two lines,
-the number of its process and its exit code. A process ends as Python would end it, but does not take all modules apart,
-which takes seconds.
+Each line that it reads is a command as JSON: `program` (of `MAIN`), `arguments`, `folder`, `environment`, `output` (the
+file that it prints into), `limit` (seconds, after which it is killed) and `bound` (whether permissions of files bind it
+where it is root, too). It answers each with two lines, the number of its process and its exit code. A process ends as
+Python would end it, but does not take all modules apart, which takes seconds.
 """
 
 from __future__ import annotations
 
 import atexit
+import ctypes
 import gc
 import json
 import os
@@ -17,11 +18,31 @@ import sys
 import traceback
 from importlib import import_module
 
-from nerfstudio.scripts import train
+from nerfstudio.scripts import eval, render, train
 
 from enerf_ns.scripts import cli
 
-MAIN = {"enerf": cli.entrypoint, "ns-train": train.entrypoint}
+MAIN = {
+    "enerf": cli.entrypoint,
+    "ns-train": train.entrypoint,
+    "ns-eval": eval.entrypoint,
+    "ns-render": render.entrypoint,
+    "python": lambda: exec(sys.argv[2], {}),
+}
+"""The programs; of Python, that with the option -c."""
+
+
+OVERRIDES = 0b110
+"""The capabilities of Linux by which root reads and writes what permissions forbid: CAP_DAC_OVERRIDE and
+CAP_DAC_READ_SEARCH."""
+
+
+def bind_to_permissions() -> None:
+    """Lets this process do no more than permissions allow, as that of any user."""
+    libc, header, sets = ctypes.CDLL(None), (ctypes.c_uint32 * 2)(0x20080522), (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, sets) == 0
+    sets[0] &= ~OVERRIDES  # of the effective ones
+    assert libc.capset(header, sets) == 0
 
 
 def forked() -> dict:
@@ -50,6 +71,8 @@ if __name__ == "__main__":
     os.dup2(output, 2)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.chdir(command["folder"])
+    if command["bound"]:
+        bind_to_permissions()
     os.environ.clear()
     os.environ.update(command["environment"])
     sys.argv = [command["program"], *command["arguments"]]

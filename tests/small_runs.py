@@ -48,7 +48,8 @@ def set_up(config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1)
     config.save_config()
     trainer = config.setup(local_rank=local_rank, world_size=world_size)
     trainer.setup()
-    trainer.pipeline.train()
+    with trainer.train_lock:  # a viewer may render
+        trainer.pipeline.train()
     return trainer
 
 

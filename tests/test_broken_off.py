@@ -19,8 +19,8 @@ pytestmark = [
 KINDS = {"index", "train", "checkpoint", "report", "convert", "simulate"}
 
 
-def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[str, int]:
-    """How often each kind of command was broken off, after all was as it should be each time."""
+def broken_off(recording: Path, folder: Path, kills: int, *ways: str) -> dict[str, dict[str, int]]:
+    """How often each kind of command was broken off in each way, after all was as it should be each time."""
     here = Path(__file__).parent
     environment = {
         "OMP_NUM_THREADS": "1",
@@ -30,7 +30,7 @@ def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[
         "PYTHONPATH": str(here),
     }
     run = subprocess.run(
-        [sys.executable, here / "broken_off.py", how, recording, folder, str(kills)],
+        [sys.executable, here / "broken_off.py", recording, folder, str(kills), *ways],
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
@@ -39,18 +39,27 @@ def broken_off(how: str, recording: Path, folder: Path, kills: int = 0) -> dict[
     return json.loads(run.stdout.splitlines()[-1])
 
 
-@pytest.mark.timeout(2400)
-@pytest.mark.parametrize("kills", [4, pytest.param(50, marks=pytest.mark.exhaustive)])
-def test_nothing_is_lost_or_half_written_where_processes_are_killed(recording: Path, tmp_path: Path, kills: int):
+@pytest.fixture(scope="module")
+def numbers(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, int]]:
+    return broken_off(recording, tmp_path_factory.mktemp("broken-off"), 3, "kill", "small-files")
+
+
+def test_nothing_is_lost_or_half_written_where_processes_are_killed(numbers: dict[str, dict[str, int]]):
     """Each at random moments, spread over the whole time that it takes. The next start works, what was left is gone
     then, and a run that goes on ends with the weights of one that was never killed."""
-    assert broken_off("kill", recording, tmp_path, kills) == dict.fromkeys(KINDS, kills)
+    assert numbers["kill"] == dict.fromkeys(KINDS, 3)
 
 
-def test_files_that_cannot_grow_leave_nothing_half_written(recording: Path, tmp_path: Path):
+def test_files_that_cannot_grow_leave_nothing_half_written(numbers: dict[str, dict[str, int]]):
     """As on a full disk, on which each write may take a part of what it is given; one sentence, and no traceback."""
-    number = broken_off("small-files", recording, tmp_path)
+    number = numbers["small-files"]
     assert number.keys() == KINDS and min(number.values()) >= 3
+
+
+@pytest.mark.timeout(2400)
+@pytest.mark.exhaustive
+def test_nor_where_they_are_killed_fifty_times(recording: Path, tmp_path: Path):
+    assert broken_off(recording, tmp_path, 50, "kill") == {"kill": dict.fromkeys(KINDS, 50)}
 
 
 @pytest.mark.exhaustive
@@ -63,5 +72,5 @@ def test_full_disks_leave_nothing_half_written(recording: Path, tmp_path: Path):
     if mount.returncode:
         pytest.skip(f"no disk can be mounted here: {mount.stderr.strip()}")
     subprocess.run(["umount", disk], check=True)
-    number = broken_off("small-disk", recording, tmp_path)
+    number = broken_off(recording, tmp_path, 0, "small-disk")["small-disk"]
     assert number.keys() == KINDS and min(number.values()) >= 2

@@ -109,7 +109,9 @@ def test_an_hour_and_a_millisecond(recording: Path, tmp_path: Path, slower: int,
     assert length == 10**8 * slower // faster and found.statistics.seconds == pytest.approx(length * 1e-9, rel=0.05)
     for name in ("per pixel", "polarity", "path", "near and far", "box", "pose coverage"):
         assert found.numbers()[name] == usual.numbers()[name]
-    assert {problem.what for problem in found.problems} == {problem.what for problem in usual.problems}
+    suspected = [problem.what for problem in found.problems if "look like microseconds" in problem.what]
+    assert len(suspected) == (faster == 100)  # a thousand times as long would be usual
+    assert {problem.what for problem in found.problems} - {*suspected} == {problem.what for problem in usual.problems}
 
     times = quick.instants(1000)
     expected = quick.trajectory.poses(torch.from_numpy(times))

@@ -336,8 +336,3 @@ def test_a_run_in_the_background_goes_on(recording: Path, tmp_path: Path):
     trainer.train()
     assert checkpoints(trainer) == ["step-000000002.ckpt"]
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-
-
-def test_whoever_leaves_the_viewer_of_a_run_that_is_done_has_a_run_that_is_done(first: Any, monkeypatch):
-    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda self: os.kill(os.getpid(), signal.SIGINT))
-    first._train_complete_viewer()

@@ -95,9 +95,9 @@ assert not any(name.split(".")[0] in ("nerfstudio", "enerf_ns") for name in sys.
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no forks")
 @pytest.mark.sweep(1)
-@pytest.mark.parametrize("part", range(3))
+@pytest.mark.parametrize("part", range(9))
 def test_every_module_of_the_plugin_can_be_imported_first(part: int):
-    modules = sorted(set(MODULES) - set(WITHOUT_NERFSTUDIO))[part::3]
+    modules = sorted(set(MODULES) - set(WITHOUT_NERFSTUDIO))[part::9]
     failed = run_python(f"{FIRST}\nprint(*[module for module in {modules} if not in_a_fork(module)])")
     assert failed.strip() == ""
 

@@ -429,7 +429,7 @@ def child(*command: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run([program, *command[1:]], capture_output=True, text=True, timeout=200, **options)
 
 
-@pytest.mark.sweep(6)
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("program", "name"), CHILDREN)
 def test_a_wrong_input_is_refused_by_the_command_itself(program, name, whole, tmp_path):
@@ -448,17 +448,8 @@ def test_a_wrong_input_is_refused_by_the_command_itself(program, name, whole, tm
     assert tree(tmp_path) == before
 
 
-WITHOUT_PRIVILEGES = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
-"""What runs a command as a root that permissions bind, too."""
-
-
-def bound(*command: str) -> list[str]:
-    program = [str(Path(sys.executable).with_name(command[0])), *command[1:]]
-    if os.geteuid() != 0:
-        return program
-    if shutil.which("setpriv") is None:
-        pytest.skip("permissions do not bind root, and there is no setpriv")
-    return [*WITHOUT_PRIVILEGES, *program]
+ROOT_OVERRIDES = hasattr(os, "geteuid") and os.geteuid() == 0
+"""Whether permissions do not bind the process of these tests."""
 
 
 FORBIDDEN: dict[str, tuple[tuple[str, ...], str]] = {
@@ -470,19 +461,19 @@ FORBIDDEN: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.skipif(ROOT_OVERRIDES and sys.platform != "linux", reason="permissions do not bind root")
 @pytest.mark.parametrize("name", FORBIDDEN)
-def test_what_the_user_may_not_touch_is_told_in_one_sentence(name: str, home: Path):
+def test_what_the_user_may_not_touch_is_told_in_one_sentence(name: str, home: Path, warm_commands: WarmCommands):
     command, said = FORBIDDEN[name]
     shutil.copytree("recording", "secret")
     Path("secret/groundtruth.txt").chmod(0)
     Path("closed").mkdir(mode=0)
     try:
-        ended = subprocess.run(bound(*command), capture_output=True, text=True, timeout=200)
+        code, printed = warm_commands.run(*command, bound=ROOT_OVERRIDES)
     finally:
         Path("closed").chmod(0o700)
-    assert ended.returncode == 1
-    assert said in check_sentence(ended.stderr) and "Permission denied" in ended.stderr
+    assert code == 1
+    assert said in check_sentence(printed) and "Permission denied" in printed
     assert not (home / "new").exists()
 
 
@@ -497,18 +488,17 @@ print(*index_events(read_recording("recording")).notes)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.skipif(ROOT_OVERRIDES and sys.platform != "linux", reason="permissions do not bind root")
 @pytest.mark.parametrize("where", [None, "closed", "closed/none"])
-def test_without_a_home_folder_the_cache_is_done_without(where: str | None, home: Path):
+def test_without_a_home_folder_the_cache_is_done_without(where: str | None, home: Path, warm_commands: WarmCommands):
     environment = {name: value for name, value in os.environ.items() if name not in ("ENERF_CACHE", "XDG_CACHE_HOME")}
     environment.pop("HOME", None)
     environment |= {"HOME": str(home / where)} if where else {}
     Path("closed").mkdir(mode=0)
-    command = bound("python", "-c", INDEX_IN_THE_CACHE)
-    ended = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=200)
+    code, printed = warm_commands.run("python", "-c", INDEX_IN_THE_CACHE, environment=environment, bound=ROOT_OVERRIDES)
     Path("closed").chmod(0o700)
-    assert ended.returncode == 0, ended.stderr
-    assert "could not be stored in the cache" in ended.stdout and ended.stdout.count("\n") == 1
+    assert code == 0, printed
+    assert "could not be stored in the cache" in printed and printed.count("\n") == 1
     assert {path.name for path in home.rglob("*")}.isdisjoint({"~", "indices", ".cache"})
 
 

@@ -39,7 +39,7 @@ class Started:
 
 
 class WarmCommands:
-    """Commands of enerf and ns-train, one after another, each in a process of its own.
+    """Commands of enerf, ns-train, ns-eval, ns-render and python -c, one after another, each in a process of its own.
 
     A process of its own that imports everything anew takes ten seconds of CPU. What a command does while it is imported
     is tested elsewhere.
@@ -53,20 +53,32 @@ class WarmCommands:
         self._program: subprocess.Popen[str] | None = None
 
     def start(
-        self, *command: object, cwd: Path | None = None, environment: Mapping[str, str] | None = None, limit: int = 60
+        self,
+        *command: object,
+        cwd: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+        limit: int = 60,
+        bound: bool = False,
     ) -> Started:
         """Starts a command, which is killed after some seconds.
 
         Args:
-            command: enerf or ns-train, and its arguments.
+            command: The program, and its arguments.
             cwd: Its working directory; that of the caller unless given.
             environment: That of the caller unless given.
             limit: Seconds.
+            bound: Whether permissions of files bind it where it is root, too, which needs Linux.
         """
         program, *arguments = map(str, command)
         printed = self._folder / str(self._started)
         self._started += 1
-        told = {"program": program, "arguments": arguments, "folder": str(cwd or Path.cwd()), "limit": limit}
+        told = {
+            "program": program,
+            "arguments": arguments,
+            "folder": str(cwd or Path.cwd()),
+            "limit": limit,
+            "bound": bound,
+        }
         told |= {"environment": {**(environment or os.environ), **ONE_THREAD}, "output": str(printed)}
         if self._program is None:
             self._program = subprocess.Popen(

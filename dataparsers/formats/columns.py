@@ -10,6 +10,14 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.time_units import (
+    FEWEST_EVENTS,
+    NAMES,
+    NANOSECONDS,
+    conversion,
+    likely_unit,
+    unit_of_date,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -33,16 +41,24 @@ def check_columns(path: Path, columns: Mapping[str, np.ndarray | h5py.Dataset], 
     Args:
         path: The file or folder of the columns.
         columns: The columns x, y, t and p by name, such as t or t.npy; p may be Boolean.
-        unit: The unit of the times, for the error message.
+        unit: The unit of the times, us or ns, for the error message.
 
     Raises:
         RecordingError: A column does not hold one whole number for each event, or there are no events.
     """
     for name, column in columns.items():
+        if name.startswith("t") and column.ndim == 1 and column.dtype.kind == "f" and len(column) >= FEWEST_EVENTS:
+            step = float(column[-1] - column[0]) / len(column)
+            likely = unit_of_date(float(column[-1])) or likely_unit(step, "events")
+            factor = NANOSECONDS[likely] / NANOSECONDS[unit]
+            raise RecordingError(
+                f"{path} holds {name} as {column.dtype}, up to {column[-1]:g}, which look like {NAMES[likely]}, but "
+                f"whole {NAMES[unit]} were expected; save np.rint({name[0]} * {factor:g}).astype(np.int64)."
+            )
         if column.ndim != 1 or column.dtype.kind not in ("iub" if name.startswith("p") else "iu"):
             raise RecordingError(
                 f"{path} holds {name} as {column.dtype} of shape {column.shape}, but one whole number for each event "
-                f"(t in {unit}) was expected; save it with .astype(np.{STORED_TYPES[name[0]].__name__})."
+                f"(t in {NAMES[unit]}) was expected; save it with .astype(np.{STORED_TYPES[name[0]].__name__})."
             )
     check_lengths(path, {name: len(column) for name, column in columns.items()})
     if not all(len(column) for column in columns.values()):
@@ -62,14 +78,16 @@ def check_times(path: Path, times: Int[np.ndarray, " times"], unit: str = "ns", 
     Args:
         path: The file.
         times: In the unit, before the offset is added.
-        unit: ns or µs.
+        unit: us or ns.
         offset: In the unit.
     """
     extremes = (int(times.min()) + offset, int(times.max()) + offset) if len(times) else (0,)
     furthest = max(extremes, key=abs)
-    if abs(furthest) >= LATEST // (1000 if unit == "µs" else 1):
+    if abs(furthest) >= LATEST // NANOSECONDS[unit]:
+        likely = unit_of_date(furthest)
         raise RecordingError(
-            f"{path} holds the time {furthest} {unit}, which is beyond 146 years; times in {unit} were expected."
+            f"{path} holds the time {furthest} {unit}, which is beyond 146 years; {NAMES[unit]} were expected"
+            + (f", and these look like {NAMES[likely]}, so {conversion(likely, unit)}." if likely else ".")
         )
 
 

@@ -18,6 +18,7 @@ from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import partial_of, write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.time_units import Times, check_units
 
 
 def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:
@@ -95,9 +96,13 @@ def convert_event_file(
         write_whole(folder / "recording.json", encode_json({"camera": about}))
         if rows is not None:
             event_recording.write_poses(folder / "poses.txt", rows[0] - file.start, *rows[1:])
-        num_events, last = event_recording.write_events(
+        num_events, _, last = event_recording.write_events(
             file.stream(), folder / "events", about["width"], about["height"], lambda i: f"{source}, event {i + 1},"
         )
+        if rows is not None and poses is not None:
+            pixels = about["width"] * about["height"]
+            events = Times.of_events(source, "us", num_events, last, pixels, is_certain=True)
+            check_units(source, [events, Times.of_rows("poses", poses, poses_unit, rows[0], "--poses-unit")])
         if rows is not None and (rows[0][-1] < file.start or rows[0][0] > file.start + last):
             raise RecordingError(
                 f"{poses} holds poses from {rows[0][0] * 1e-9:.6f} s to {rows[0][-1] * 1e-9:.6f} s, but the events of "

@@ -68,6 +68,11 @@ def read(folder: Path) -> EventRecording:
         frames=Frames(frame_files, frame_times - zero, camera, trajectory) if frame_files else None,
         notes=tuple(notes),
         locate_event=lambda index: f"{events_file}, line {index + 1}",
+        times_in={
+            "events": (events_file, "s"),
+            "poses": (folder / "groundtruth.txt", "s"),
+            "frames": (folder / "images.txt", "s"),
+        },
     )
 
 
@@ -91,7 +96,7 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
     unlisted = len(found.difference(files))
     if unlisted:
         notes.append(f"{unlisted} of {len(found)} images are not listed in images.txt and are not used.")
-    return files, parse_times(path, [row[0] for row in rows], numbers, "s")
+    return files, parse_times(path, [row[0] for row in rows], numbers, "s", "frames")
 
 
 def _read_camera(path: Path, width: int, height: int) -> Camera:

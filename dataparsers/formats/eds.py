@@ -41,6 +41,7 @@ from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, in_colour, read_text
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
@@ -49,6 +50,8 @@ SENSOR_SIZE = (640, 480)
 """Width and height of the event camera, and of the images, in pixels."""
 
 RAW_POSES, PREPARED_POSES = "stamped_groundtruth.txt", "stamped_groundtruth_us.txt"
+UNITS = {RAW_POSES: "s", PREPARED_POSES: "us"}
+"""Unit of the times in each file of poses."""
 RAW_IMAGES, PREPARED_IMAGES = "images", "images_undistorted_calib0"
 STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
 
@@ -102,8 +105,12 @@ def read(folder: Path) -> EventRecording:
     """
     notes: list[str] = []
     events = Hdf5Events(folder / "events.h5")
-    prepared, (pose_times, positions, quaternions) = _read_poses(folder, events, notes)
-    image_files, image_times = _read_image_list(folder, prepared, events, notes)
+    poses_file, (pose_times, positions, quaternions) = _read_poses(folder, events, notes)
+    prepared = poses_file.name == PREPARED_POSES
+    poses_in = poses_file, UNITS[poses_file.name]
+    image_files, image_times, stamps_file = _read_image_list(
+        folder, prepared, events, Times.of_rows("poses", *poses_in, pose_times), notes
+    )
     zero = 0 if prepared else int(min(events.first_time, pose_times[0], *image_times[:1]))
     trajectory = Trajectory(pose_times - zero, positions, quaternions)
 
@@ -139,15 +146,16 @@ def read(folder: Path) -> EventRecording:
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,
+        times_in={"events": (events.path, "us"), "poses": poses_in, "frames": (stamps_file, "us")},
     )
 
 
-def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[bool, Poses]:
-    """Returns whether the events are on the clock of the prepared files, and the poses on this clock."""
+def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[Path, Poses]:
+    """Returns the file of the poses on the clock of the events, and these poses."""
     found: dict[Path, Poses] = {}
     notes_of: dict[Path, list[str]] = {}
-    for path, unit in ((folder / RAW_POSES, "s"), (folder / PREPARED_POSES, "us")):
-        if path.exists():
+    for name, unit in UNITS.items():
+        if (path := folder / name).exists():
             found[path] = read_poses(path, unit, notes_of.setdefault(path, []))
     if not found:
         raise RecordingError(
@@ -155,7 +163,7 @@ def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[boo
             "of the event camera; add one."
         )
     times = {path: poses[0] for path, poses in found.items()}
-    best = _on_the_clock_of(events, times)
+    best = _on_the_clock_of(events, "poses", times)
     if len(found) == 2:
         raw_times, prepared_times = times.values()
         _check_offset(folder, int(raw_times[0] - prepared_times[0]))
@@ -167,7 +175,7 @@ def _read_poses(folder: Path, events: Hdf5Events, notes: list[str]) -> tuple[boo
             )
         notes.append(f"Of {RAW_POSES} and {PREPARED_POSES}, {best.name} is used, which is on the clock of events.h5.")
     notes += notes_of[best]
-    return best.name == PREPARED_POSES, found[best]
+    return best, found[best]
 
 
 def _check_offset(folder: Path, offset: int) -> None:
@@ -183,9 +191,9 @@ def _check_offset(folder: Path, offset: int) -> None:
 
 
 def _read_image_list(
-    folder: Path, prepared: bool, events: Hdf5Events, notes: list[str]
-) -> tuple[tuple[Path, ...], Int64[np.ndarray, " images"]]:
-    """Returns the images that are used, and their stamps on the clock of the events."""
+    folder: Path, prepared: bool, events: Hdf5Events, poses: Times, notes: list[str]
+) -> tuple[tuple[Path, ...], Int64[np.ndarray, " images"], Path]:
+    """Returns the images that are used, their stamps on the clock of the events, and the file of the stamps."""
     images = {folder / name: images_in(folder / name) for name in (RAW_IMAGES, PREPARED_IMAGES)}
     images = {path: files for path, files in images.items() if path.is_dir()}
     of_clock, other = (PREPARED_IMAGES, RAW_IMAGES) if prepared else (RAW_IMAGES, PREPARED_IMAGES)
@@ -196,15 +204,15 @@ def _read_image_list(
             notes.append(
                 f"There are stamps of images, but no folder {RAW_IMAGES}/ or {PREPARED_IMAGES}/, so no frame is used."
             )
-        return (), np.zeros(0, np.int64)
+        return (), np.zeros(0, np.int64), folder
     if not stamps:
         raise RecordingError(
             f"{folder} holds {len(images[place]):,} images, but {' and '.join(STAMPS)} are missing; add the one that "
             "holds their stamps (t_us)."
         )
-    path = _on_the_clock_of(events, stamps)
+    path = _on_the_clock_of(events, "frames", stamps, poses)
     check_one_each(place, len(images[place]), path, len(stamps[path]), "stamps")
-    return images[place], stamps[path]
+    return images[place], stamps[path], path
 
 
 def _overlap(events: Hdf5Events, times: Int64[np.ndarray, " rows"]) -> int:
@@ -212,10 +220,23 @@ def _overlap(events: Hdf5Events, times: Int64[np.ndarray, " rows"]) -> int:
     return int(min(times[-1], events.last_time) - max(times[0], events.first_time))
 
 
-def _on_the_clock_of(events: Hdf5Events, tables: dict[Path, Int64[np.ndarray, " rows"]]) -> Path:
-    """Returns the file whose times (ns) overlap most with the times of the events."""
+def _on_the_clock_of(
+    events: Hdf5Events, kind: str, tables: dict[Path, Int64[np.ndarray, " rows"]], *known: Times
+) -> Path:
+    """Returns the file whose times (ns) overlap most with the times of the events.
+
+    Args:
+        events: The events.
+        kind: "poses" or "frames".
+        tables: The times in each file.
+        known: Other times on this clock.
+    """
     best = max(tables, key=lambda path: _overlap(events, tables[path]))
     if _overlap(events, tables[best]) < 0:
+        rows = Times.of_rows(kind, best, UNITS.get(best.name, "us"), tables[best])
+        columns = [events.times(SENSOR_SIZE[0] * SENSOR_SIZE[1]), *known, rows]
+        check_units(best.parent, columns)
+        check_usual_units(best.parent, columns)
         ranges = " and ".join(f"{path.name} times from {_span(rows[0], rows[-1])}" for path, rows in tables.items())
         raise RecordingError(
             f"{best.parent} holds {ranges}, but events.h5 times from {_span(events.first_time, events.last_time)}; "

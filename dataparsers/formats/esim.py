@@ -79,8 +79,9 @@ def read(folder: Path) -> EventRecording:
 
     num_rows = [_num_rows(file) for file in event_files]
     with of_file(simulation_file):
-        frames = _read_frames(folder / "images", camera, trajectory, None if exposure is None else 0)
-        blurred_frames = _read_frames(folder / "images_corrupted", camera, trajectory, exposure)
+        rig = camera, trajectory, poses_files[0]
+        frames = _read_frames(folder / "images", *rig, None if exposure is None else 0)
+        blurred_frames = _read_frames(folder / "images_corrupted", *rig, exposure)
         return EventRecording(
             path=folder,
             format="esim",
@@ -96,6 +97,12 @@ def read(folder: Path) -> EventRecording:
             notes=tuple(notes),
             locate_event=lambda index: _locate(event_files, num_rows, index),
             num_events=sum(num_rows),
+            times_in={
+                "events": (folder / "events", "ns"),
+                "poses": (poses_files[0], "ns"),
+                "frames": (folder / "images/image_stamps_ns.txt", "ns"),
+                "blurred frames": (folder / "images_corrupted/image_stamps_ns.txt", "ns"),
+            },
         )
 
 
@@ -128,11 +135,15 @@ def _read_poses_bounds(path: Path) -> tuple[Camera, tuple[float, float] | None]:
     return camera, (near, far) if 0 < near < far < np.inf else None
 
 
-def _read_frames(folder: Path, camera: Camera, trajectory: Trajectory, exposure: int | None) -> Frames | None:
+def _read_frames(
+    folder: Path, camera: Camera, trajectory: Trajectory, poses_file: Path, exposure: int | None
+) -> Frames | None:
     check_is_folder(folder.parent / "depth", "a folder of depth maps")
     depth_files = sorted((folder.parent / "depth").glob("*.npy"))
-    frames = read_frames(images_in(folder), folder / "image_stamps_ns.txt", camera, trajectory, depth_files)
-    return frames and frames.with_exposure(exposure)
+    stamps_file = folder / "image_stamps_ns.txt"
+    return read_frames(
+        images_in(folder), stamps_file, camera, trajectory, depth_files, exposure=exposure, poses_file=poses_file
+    )
 
 
 def _stream_events(files: list[Path], num_rows: list[int]) -> Iterator[Events]:

@@ -105,6 +105,7 @@ def read(folder: Path) -> EventRecording:
             refractory_period=refractory_period,
             bayer_pattern=bayer_pattern,
             notes=tuple(notes),
+            times_in={"events": (path, "ns"), "poses": (path, "ns")},
         )
 
 

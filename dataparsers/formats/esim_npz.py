@@ -78,6 +78,7 @@ def read(folder: Path) -> EventRecording:
             bayer_pattern=bayer_pattern,
             notes=tuple(notes),
             num_events=num_events,
+            times_in={"events": (events_file, "ns"), "poses": (poses_file, "ns")},
         )
 
 

@@ -120,6 +120,12 @@ def read(folder: Path) -> EventRecording:
             response=about.found.get("response"),
             notes=tuple(notes),
             num_events=len(columns["t"]),
+            times_in={
+                "events": (folder / "events/t.npy", "ns"),
+                "poses": (folder / "poses.txt", "ns"),
+                "frames": (folder / "frames/stamps_ns.txt", "ns"),
+                "blurred frames": (folder / "blurred_frames/stamps_ns.txt", "ns"),
+            },
         )
 
 
@@ -134,8 +140,8 @@ def write(recording: EventRecording, folder: Path) -> int:
         The number of events.
 
     Raises:
-        RecordingError: An event lies outside the sensor, goes back in time or has another polarity, or the camera of
-            the frames is not fixed to the event camera.
+        RecordingError: An event lies outside the sensor, goes back in time or has another polarity, times are in
+            another unit, or the camera of the frames is not fixed to the event camera.
         OSError: The disk is full, or a frame cannot be copied.
     """
     kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
@@ -161,7 +167,11 @@ def write(recording: EventRecording, folder: Path) -> int:
             _write_frames(frames, folder / name, folder / "depth")
 
     size = recording.camera.width, recording.camera.height
-    return write_events(recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events)[0]
+    num_events, first, last = write_events(
+        recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events
+    )
+    recording.check_units(num_events, last - first)
+    return num_events
 
 
 def write_events(
@@ -171,7 +181,7 @@ def write_events(
     height: int,
     locate: Callable[[int], str],
     total: int | None = None,
-) -> tuple[int, int]:
+) -> tuple[int, int, int]:
     """Writes events piece by piece into x.npy, y.npy, t.npy and p.npy, and shows the progress.
 
     Args:
@@ -182,24 +192,25 @@ def write_events(
         total: Number of events, if it is known.
 
     Returns:
-        The number of events, and the time of the last one (ns).
+        The number of events, and the times of the first and of the last one (ns).
 
     Raises:
         RecordingError: There are no events, or one lies outside the sensor, goes back in time or has another polarity.
         OSError: The disk is full.
     """
-    num_events, last = 0, -LATEST
+    num_events, first, last = 0, 0, -LATEST
     columns = (TextColumn("Writing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
     with closing(_ColumnFiles(folder)) as files, Progress(*columns, transient=True) as progress:
         task = progress.add_task("", total=total)
         for events in filter(len, stream):
             _check_events(events, last, width, height, lambda i, before=num_events: locate(before + i))
             files.append(events)
+            first = first if num_events else int(events.t[0])
             num_events, last = num_events + len(events), int(events.t[-1])
             progress.update(task, completed=num_events)
     if num_events == 0:
         raise RecordingError(f"{locate(0)} is missing, since there are no events; give a recording with some.")
-    return num_events, last
+    return num_events, first, last
 
 
 def write_poses(
@@ -367,7 +378,9 @@ def _read_frames(
 ) -> Frames | None:
     kinds = Image.registered_extensions()
     files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
-    frames = read_frames(files, folder / "stamps_ns.txt", camera, trajectory, depth_files, folder / EXPOSURES_NAME)
+    stamps_file, exposures_file = folder / "stamps_ns.txt", folder / EXPOSURES_NAME
+    poses_file = folder.parent / "poses.txt"
+    frames = read_frames(files, stamps_file, camera, trajectory, depth_files, exposures_file, poses_file=poses_file)
     return frames and replace(frames, stated_white=white)
 
 

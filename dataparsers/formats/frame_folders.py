@@ -13,6 +13,7 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import LONGEST_EXPOSURE, Frames
+from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 
@@ -59,6 +60,8 @@ def read_frames(
     trajectory: Trajectory,
     depth_files: Sequence[Path] = (),
     exposures_file: Path | None = None,
+    exposure: int | None = None,
+    poses_file: Path | None = None,
 ) -> Frames | None:
     """Returns the frames of one camera; of images and depth maps, only the headers are read.
 
@@ -69,18 +72,23 @@ def read_frames(
         trajectory: The trajectory of this camera.
         depth_files: One .npy file for each frame, or none.
         exposures_file: The table with one exposure (ns) in each line, in the order of the stamps; may be missing.
+        exposure: The exposure (ns) of all frames, if there is no such table.
+        poses_file: The file of the poses, for error messages. Default: the folder.
 
     Returns:
         None if there are neither images nor stamps.
 
     Raises:
         RecordingError: The numbers of stamps, exposures, depth maps and images differ, a file cannot be read, a size is
-            not the camera's, or an exposure is out of range.
+            not the camera's, an exposure is out of range, or stamps and poses are in different units.
     """
     check_is_folder(stamps_file.parent, "a folder of frames")
     if not files and not stamps_file.exists():
         return None
     times = read_stamps(files, stamps_file, "ns", stamps_file.parent)
+    columns = [Times.of_rows("poses", poses_file or stamps_file.parent, "ns", trajectory.times)]
+    columns.append(Times.of_rows("frames", stamps_file, "ns", times))
+    check_units(stamps_file.parent, columns)
     check_image_sizes(files, camera.width, camera.height)
     if depth_files and len(depth_files) != len(files):
         raise RecordingError(
@@ -94,10 +102,16 @@ def read_frames(
                 f"{file} holds an array of shape {shape}, but the frames have (height, width) = "
                 f"{(camera.height, camera.width)}."
             )
-    exposures = None
+    exposures = None if exposure is None else np.full(len(times), min(exposure, LONGEST_EXPOSURE))
     if exposures_file is not None and exposures_file.exists():
         rows, numbers = read_rows(exposures_file, "exposure_ns")
         values = parse_numbers(exposures_file, rows, numbers)[:, 0].clip(-LONGEST_EXPOSURE, LONGEST_EXPOSURE)
         exposures = np.copysign(np.ceil(np.abs(values)), values).astype(np.int64)  # a fraction must not become 0
-    with of_file(exposures_file or stamps_file):
+    try:
         return Frames(tuple(files), times, camera, trajectory, tuple(depth_files) or None, exposures)
+    except ValueError:
+        check_usual_units(stamps_file.parent, columns)
+        if exposures_file is None:
+            raise
+        with of_file(exposures_file):
+            raise

@@ -24,6 +24,7 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
+from enerf_ns.dataparsers.recording.time_units import Times
 
 if TYPE_CHECKING:
     import h5py
@@ -67,12 +68,16 @@ class Hdf5Events:
             columns = self._columns(file)
             for column in columns.values():
                 _check_filters(self.path, column)
-            check_columns(self.path, columns, "µs")
+            check_columns(self.path, columns, "us")
             self._offset = self._read_offset(file)
             self._cache = max(SMALLEST_CACHE, *(_chunk_bytes(column) for column in columns.values()))
             self.num_events = len(columns["t"])
             self.first_time = int(self._times(columns["t"], 0, 1, 0)[0])
             self.last_time = int(self._times(columns["t"], self.num_events - 1, self.num_events, 0)[0])
+
+    def times(self, pixels: int) -> Times:
+        """Returns the times of the events of a sensor with so many pixels."""
+        return Times.of_events(self.path, "us", self.num_events, self.last_time - self.first_time, pixels)
 
     def stream(self, zero: int) -> Iterator[Events]:
         """Yields the `num_events` events in file order, `EVENTS_AT_A_TIME` at once.
@@ -140,7 +145,7 @@ class Hdf5Events:
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
         """Returns the times of some events, nanoseconds from `zero`."""
         times = column[start:stop]
-        check_times(self.path, times, "µs", self._offset)
+        check_times(self.path, times, "us", self._offset)
         times = times.astype(np.int64)
         times *= 1000
         times += self._offset * 1000 - zero

@@ -18,6 +18,7 @@ from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, image_size, of_file
 from enerf_ns.dataparsers.recording.recording import Frames
+from enerf_ns.dataparsers.recording.time_units import unit_by_step
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 SHORTEST_STEP = 1000
@@ -67,9 +68,10 @@ def checked_trajectory(
     kept = order[np.diff(times[order], prepend=-LATEST) >= SHORTEST_STEP]
     dropped = len(times) - len(kept)
     if len(kept) < 2 or dropped >= len(kept):
+        wrong = unit_by_step(float(np.median(np.diff(times[order]))), "ns", "poses")
         raise RecordingError(
-            f"{path} holds {len(times):,} poses, but {dropped:,} of them follow another one within 1 µs; give one pose "
-            "for each time, and times in nanoseconds."
+            f"{path} holds {len(times):,} poses, but {dropped:,} of them follow another one within 1 µs; "
+            f"{wrong or 'give one pose for each time, and times in nanoseconds'}."
         )
     if dropped:
         notes.append(

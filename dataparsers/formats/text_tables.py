@@ -11,8 +11,7 @@ from jaxtyping import Float64, Int64
 from enerf_ns.dataparsers.formats.columns import LATEST, unit_quaternions
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import read_text
-
-NANOSECONDS = {"s": Decimal(10) ** 9, "us": Decimal(1000), "ns": Decimal(1)}
+from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, unit_by_step
 
 
 def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
@@ -47,8 +46,17 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
     return rows, numbers
 
 
-def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> Int64[np.ndarray, " rows"]:
+def parse_times(
+    path: Path, cells: list[str], numbers: list[int], unit: str, kind: str = "poses"
+) -> Int64[np.ndarray, " rows"]:
     """Returns nanoseconds from decimal text in the unit "s", "us" or "ns", exact at any number of digits.
+
+    Args:
+        path: The file, for error messages.
+        cells: The text of each row.
+        numbers: The number of its line.
+        unit: The unit.
+        kind: "poses" or "frames", whose usual rate tells another unit.
 
     Raises:
         RecordingError: A cell is not a finite number, or the times do not increase.
@@ -62,14 +70,28 @@ def parse_times(path: Path, cells: list[str], numbers: list[int], unit: str) -> 
         except (ArithmeticError, ValueError) as error:
             raise _not_a_number(path, number, cell) from error
         if abs(time) >= LATEST:
-            raise RecordingError(f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years.")
-        if times and time <= times[-1]:
+            wrong = _wrong_unit(cells, unit, kind) or "give times in this unit"
             raise RecordingError(
-                f"{path}, line {number} has the time {cell} {unit}, which is not after that of the row before; times "
-                "must increase from row to row."
+                f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years; {wrong}."
+            )
+        if times and time <= times[-1]:
+            is_rounded = Decimal(cell) > Decimal(cells[len(times) - 1])
+            wrong = is_rounded and _wrong_unit(cells, unit, kind)
+            raise RecordingError(
+                f"{path}, line {number} has the time {cell} {unit}, which is not after that of the row before; "
+                f"{wrong or 'times must increase from row to row'}."
             )
         times.append(time)
     return np.array(times, dtype=np.int64)
+
+
+def _wrong_unit(cells: list[str], unit: str, kind: str) -> str | None:
+    """Returns words on the unit in which times that increase seem to be written, if it is another one than stated."""
+    try:
+        step = float(np.median(np.diff(np.array(cells, np.longdouble)))) if len(cells) > 1 else 0.0
+    except ValueError:
+        return None
+    return unit_by_step(step, unit, kind)
 
 
 def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Float64[np.ndarray, "rows columns"]:
@@ -90,7 +112,7 @@ def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Floa
 def read_times(path: Path, unit: str) -> Int64[np.ndarray, " rows"]:
     """Returns the times (ns) of a file with one time in each line; raises what `parse_times` raises."""
     rows, numbers = read_rows(path, f"t_{unit}")
-    return parse_times(path, [row[0] for row in rows], numbers, unit)
+    return parse_times(path, [row[0] for row in rows], numbers, unit, "frames")
 
 
 def read_poses(

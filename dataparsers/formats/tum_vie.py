@@ -55,7 +55,8 @@ from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json,
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file
-from enerf_ns.dataparsers.recording.recording import LARGEST_SPAN_RATIO, EventRecording, Frames
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("*events_left.h5", "*events_right.h5", "*mocap*.txt", "*vi_gt_data/mocap_data.txt", "calib_undist.json")
@@ -101,9 +102,6 @@ SEQUENCES = {
 """Names of the sequences, by the letter of their calibration."""
 
 CALIBRATIONS = ("camera-calibration", "mocap-imu-calibration")
-
-SHORTEST_STEP = 100_000
-"""Least median time between frames or poses, nanoseconds."""
 
 BALANCE_TOLERANCE = 1.0
 """Largest difference between stated intrinsics and OpenCV's, pixels. Versions of OpenCV differ by less."""
@@ -154,9 +152,9 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     images = data / f"{event_camera}_images{'_undistorted' * is_prepared}"
     poses_file = _find_one(data, "*mocap*.txt", "poses (t_us px py pz qx qy qz qw)")
     pose_times, positions, quaternions = read_poses(poses_file, "us", notes)
-    _check_unit(poses_file, pose_times, longest=len(pose_times) * 10**9)
-    longest = LARGEST_SPAN_RATIO * int(pose_times[-1] - pose_times[0])
-    frame_files, stamps, frame_times, exposures = _read_frames(images, event_camera, longest, notes)
+    poses = Times.of_rows("poses", poses_file, "us", pose_times)
+    check_units(folder, [events.times(SENSOR_SIZE[0] * SENSOR_SIZE[1]), poses])
+    frame_files, stamps, frame_times, exposures = _read_frames(images, event_camera, poses, notes)
     zero = int(min(events.first_time, pose_times[0], *stamps[:1]))
 
     if is_prepared:
@@ -181,6 +179,11 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,
+        times_in={
+            "events": (events_file, "us"),
+            "poses": (poses_file, "us"),
+            "frames": (_stamps_file(images, event_camera), "us"),
+        },
     )
 
 
@@ -210,20 +213,21 @@ def _data_folder(folder: Path, sequence: str) -> Path:
 
 
 def _read_frames(
-    folder: Path, side: str, longest: int, notes: list[str]
+    folder: Path, side: str, poses: Times, notes: list[str]
 ) -> tuple[
     tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"] | None
 ]:
     """Returns files, stamps, middles of the exposures (both ns on the clock of the data set), and exposures (ns).
 
-    The exposures are None if they are not known. The stamps may span at most `longest` ns.
+    The exposures are None if they are not known.
     """
     files = images_in(folder)
-    stamps_file = _here_or_above(folder, f"image_timestamps_{side}.txt")
+    stamps_file = _stamps_file(folder, side)
     if not files and not stamps_file.exists():
         return (), np.zeros(0, np.int64), np.zeros(0, np.int64), None
     stamps = read_stamps(files, stamps_file, "us", folder)
-    _check_unit(stamps_file, stamps, longest)
+    columns = [poses, Times.of_rows("frames", stamps_file, "us", stamps)]
+    check_units(folder, columns)
     exposures_file = _here_or_above(folder, f"image_exposures_{side}.txt")
     if not exposures_file.exists():
         notes.append(f"{exposures_file.name} is missing, so each frame has the pose at its stamp.")
@@ -236,6 +240,7 @@ def _read_frames(
     middles = stamps + np.rint(exposures.clip(0, gap) * 500).astype(np.int64)
     fit = (exposures >= 0).all() and exposures.max() <= gap and not 0 < exposures.max() < 1
     if not fit or (np.diff(middles) <= 0).any():
+        check_usual_units(folder, columns)
         raise RecordingError(
             f"{exposures_file} holds exposures from {exposures.min():g} to {exposures.max():g} us, which do not fit "
             f"frames at most {gap:g} us apart; exposures in microseconds were expected."
@@ -243,19 +248,13 @@ def _read_frames(
     return files, stamps, middles, np.rint(exposures * 1000).astype(np.int64)
 
 
+def _stamps_file(folder: Path, side: str) -> Path:
+    return _here_or_above(folder, f"image_timestamps_{side}.txt")
+
+
 def _here_or_above(folder: Path, name: str) -> Path:
     above = folder.parent / name
     return above if above.exists() and not (folder / name).exists() else folder / name
-
-
-def _check_unit(path: Path, times: Int64[np.ndarray, " rows"], longest: int) -> None:
-    """Checks that times are at least 0.1 ms apart (median) and span at most `longest` ns, as in the right unit."""
-    steps = np.diff(times)
-    if len(steps) and (np.median(steps) < SHORTEST_STEP or steps.sum() > longest):
-        raise RecordingError(
-            f"{path} has times {np.median(steps) * 1e-3:g} us apart (median) over {steps.sum() * 1e-9:g} s, which "
-            "fits no recording; microseconds were expected."
-        )
 
 
 def _read_raw_rig(folder: Path, data: Path, side: str, sequence: str, has_frames: bool, notes: list[str]) -> _Rig:

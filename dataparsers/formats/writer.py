@@ -104,11 +104,9 @@ class Writer(ABC):
     """Number of events added so far."""
     num_frames: int = 0
     """Number of frames added so far."""
-    notes: list[str]
-    """Sentences for the user."""
 
     def __init__(self, folder: Path, setup: Setup):
-        self.folder, self.setup, self.notes = folder, setup, []
+        self.folder, self.setup = folder, setup
         try:
             check_rotation(setup.event_from_frame[:3, :3])
         except ValueError as error:

@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Int64
+from rich import get_console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
@@ -17,16 +18,12 @@ from enerf_ns.dataparsers.index.index_cache import build_index, entry_name, load
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.recording.recording import (
     EVENTS_AT_A_TIME,
-    LARGEST_SPAN_RATIO,
     EventRecording,
     Events,
     left_out,
     percent,
     seconds,
 )
-
-LARGEST_RATE = 2e9
-"""Event rate (events per second) that no sensor can send. If it is higher, the unit of the times is wrong."""
 
 SILENT_SECONDS = 2.0
 """Seconds of indexing before a progress bar is shown."""
@@ -135,13 +132,13 @@ def describe_gaps(gaps: Int64[np.ndarray, "gaps 2"]) -> str:
 
 
 def _check(recording: EventRecording, survey: Survey) -> None:
-    path, camera, trajectory = recording.path, recording.camera, recording.trajectory
+    path, camera = recording.path, recording.camera
     x, y, t, p = survey.odd_event
     if survey.outside is not None:
         name, value, size = ("x", x, survey.width) if not 0 <= x < survey.width else ("y", y, camera.height)
         raise RecordingError(
             f"{recording.locate(survey.outside)} holds {name} = {value}, which lies outside the sensor of "
-            f"{camera.width} x {camera.height} pixels ({name} from 0 to {size - 1})."
+            f"{camera.width} x {camera.height} pixels ({name} from 0 to {size - 1}){_why_outside(recording)}."
         )
     if survey.backwards is not None:
         raise RecordingError(
@@ -153,14 +150,7 @@ def _check(recording: EventRecording, survey: Survey) -> None:
             f"{recording.locate(survey.odd_polarity)} holds polarity {p}, but a recording's polarities must all be 0 "
             "or 1, or all be -1 or 1."
         )
-    span, poses = (survey.last - survey.first) * 1e-9, (trajectory.end - trajectory.start) * 1e-9
-    if survey.num_events >= 1000 and (
-        survey.num_events > LARGEST_RATE * span or not 1 / LARGEST_SPAN_RATIO < span / poses < LARGEST_SPAN_RATIO
-    ):
-        raise RecordingError(
-            f"{path} holds {survey.num_events:,} events within {span:.6g} s and poses within {poses:.6g} s, "
-            "which does not fit together; state the times of both in the unit that the format asks for."
-        )
+    recording.check_units(survey.num_events, survey.last - survey.first)
     if not survey.counts.any():
         raise RecordingError(
             f"The poses of {path} do not cover the events, which lie from {seconds(survey.first)} to "
@@ -179,6 +169,27 @@ def _check(recording: EventRecording, survey: Survey) -> None:
         )
 
 
+def _why_outside(recording: EventRecording) -> str:
+    """Words on why events lie outside the sensor, from the largest x and y of all events; empty if none is known."""
+    camera, pieces = recording.camera, list(_largest_of_pieces(recording))
+    across, down = (max(column) + 1 for column in zip(*pieces, strict=True))
+    found = f"; all x lie below {across:,} and all y below {down:,}"
+    if across <= camera.width and down <= camera.height:
+        return ""  # numbers below 0
+    if across <= camera.height and down <= camera.width:
+        if camera.has_sides_swapped:
+            return f"{found}, so width and height of the calibration seem to be swapped: exchange them"
+        return f"{found}, so x and y of the events seem to be swapped: exchange the two columns"
+    if (across, down) == (camera.width + 1, camera.height + 1):
+        return f"{found}, so coordinates seem to start at 1: subtract 1 from both"
+    return f"{found}: give the calibration of this resolution of the sensor"
+
+
+def _largest_of_pieces(recording: EventRecording) -> Iterator[tuple[int, int]]:
+    """The largest x and y of each piece of the events."""
+    return ((int(events.x.max()), int(events.y.max())) for events in recording.stream_events() if len(events))
+
+
 def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
     """A stream that shows a progress bar after `SILENT_SECONDS`.
 
@@ -189,7 +200,7 @@ def _with_progress(stream: EventStream, num_events: int | None) -> EventStream:
 
     def watched() -> Iterator[Events]:
         columns = (TextColumn("Indexing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
-        progress = Progress(*columns, transient=True)
+        progress = Progress(*columns, transient=True, disable=not get_console().is_terminal)
         task = progress.add_task("", total=num_events)
         begin = time.monotonic()
         try:

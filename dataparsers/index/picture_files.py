@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import cv2
+from rich import get_console
 from rich.progress import track
 
 from enerf_ns.dataparsers.index.index_cache import cache_folder
@@ -37,7 +38,9 @@ def write_pictures(frames: Frames) -> list[Path]:
             f"The undistorted pictures cannot be written ({error.strerror}); set ENERF_CACHE to a folder for them."
         ) from error
     missing = [i for i, place in enumerate(places) if not _is_current(place, frames.filenames[i])]
-    for i in track(missing, "Writing undistorted pictures", transient=True, disable=not missing):
+    for i in track(
+        missing, "Writing undistorted pictures", transient=True, disable=not missing or not get_console().is_terminal
+    ):
         picture, state = in_8_bits(frames.picture(i)), frames.filenames[i].stat()
         encoded = cv2.imencode(".png", picture[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
         try:

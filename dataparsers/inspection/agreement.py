@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from enerf_ns.dataparsers.inspection.focus import (
     AS_READ,
     AS_STATED,
+    INVERSE,
     READINGS,
     SCALAR_FIRST,
     SCALAR_LAST,
@@ -38,6 +39,9 @@ OTHER_LENSES = tuple(1.2**step for step in range(-10, 11) if step)
 """Multiples of the stated focal length, from 0.16 to 6.2, that are tried because the calibration may be of another
 lens."""
 
+NEAR_AND_FAR_LENSES = (0.4, 0.83, 1.2, 2.5)
+"""Multiples of the stated focal length in the quick check, of which one is nearer to the true one if that is wrong."""
+
 FRAME_SCALES = tuple(1.02**step for step in range(-92, 93))
 """Multiples of the focal length of frames that are tried."""
 
@@ -46,8 +50,8 @@ SMALLEST_FIT = 0.6
 else is wrong."""
 
 LENS_GAIN = 1.05
-"""Factor by which another lens must sharpen the events before the best focal length is searched around it. The factor
-is 1.1 if the focal length is wrong by a fifth."""
+"""Factor by which another lens, or another delay in the quick check, must sharpen the events before the best one is
+searched. The factor is 1.1 if the focal length is wrong by a fifth."""
 
 SMALLEST_TURN = math.radians(0.5)
 """Angle by which the camera must turn within a window before another lens is tried. Without turns, the focal length
@@ -75,6 +79,10 @@ HARMFUL_SCALE = 0.03
 
 CLEARLY = 1.25
 """Factor by which the right reading of the poses must be sharper than the wrong ones. It is 1.9 for known poses."""
+
+LONGER_WINDOWS = (1.0, 4.0, 16.0)
+"""Multiples of the assumed depth of the scene that are tried until the readings of the poses differ clearly. With too
+small a depth, which wrong poses often show, windows are too short for that."""
 
 ALIKE = 0.97
 """Share of the best sharpness above which another reading of the poses is as likely as the best one."""
@@ -180,6 +188,30 @@ def clock_and_lens(recording: EventRecording, distance: float) -> tuple[Estimate
     return trials.clock_and_lens(AS_READ, 1.0)
 
 
+def is_in_focus(recording: EventRecording, distance: float) -> bool:
+    """Whether events are sharpest with poses, clock and focal length as stated. Takes about a second.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        distance: Usual depth of the scene, metres.
+
+    Returns:
+        True also if there are too few events to compare.
+    """
+    trials = _Trials(EventFocus(recording, distance))
+    if not trials.focus.windows:
+        return True
+    heights = {one: float(trials.curve([Hypothesis(reading=one)]).sum()) for one in (AS_READ, *READINGS)}
+    readings, is_clear = _best_readings(recording.trajectory, heights)
+    if not is_clear or AS_READ not in readings:
+        return False
+    focus, delays = trials.focus, [delay * MILLISECOND for delay in SHOWN_DELAYS]
+    others = [Hypothesis(delay) for delay in delays if abs(delay) <= focus.largest_delay]
+    if focus.turn >= SMALLEST_TURN:
+        others += [Hypothesis(focal_scale=lens) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
+    return all(trials.curve([other]).sum() < LENS_GAIN * heights[AS_READ] for other in others)
+
+
 def clock_of_frames(recording: EventRecording, depth_range: tuple[float, float]) -> Estimate | None:
     """Milliseconds by which frames are stamped later than events of the same instant, from edges in both.
 
@@ -227,33 +259,31 @@ class Agreement:
     """None without frames in which the same corners are found."""
 
     @classmethod
-    def of(cls, recording: EventRecording, depth_range: tuple[float, float] | None) -> Agreement | None:
+    def of(
+        cls, recording: EventRecording, depth_range: tuple[float, float] | None, with_frames: bool = True
+    ) -> Agreement | None:
         """Tries other clocks, readings of the poses and focal lengths. Takes some seconds.
 
         Args:
             recording: Its index is made if it is not there yet.
             depth_range: Nearest and farthest depth, metres, if known.
+            with_frames: Whether frames are compared, too.
 
         Returns:
             None if the events are too few, or the recording is too short.
         """
         near, far = depth_range or 2 * (float(np.linalg.norm(np.ptp(recording.trajectory.positions, axis=0))) or 1.0,)
-        focus = EventFocus(recording, math.sqrt(near * far))
-        if not focus.windows:
+        search = _search(recording, math.sqrt(near * far))
+        if search is None:
             return None
-        trials = _Trials(focus)
-        pose_delay = trials.delay(AS_READ, 1.0)
-        stated = [Hypothesis(), Hypothesis(round(pose_delay.value * MILLISECOND))]
-        other = _other_lens(trials, stated) if focus.turn >= SMALLEST_TURN else None
-        tried_for_all = stated if other is None else [*stated, other]
-        heights = {
-            reading: float(trials.curve([replace(one, reading=reading) for one in tried_for_all]).sum(1).max())
-            for reading in (AS_READ, *READINGS)
-        }
-        readings, is_clear = _best_readings(recording.trajectory, heights)
-        lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
+        trials, readings, is_clear, lens = search
+        focus = trials.focus
         pose_delay, focal_scale = trials.clock_and_lens(readings[0], lens)
         trials.curve([hypothesis for hypothesis in shown_hypotheses() if focus.allows(hypothesis.focal_scale)])
+        total = {hypothesis: float(curves.sum()) for hypothesis, curves in trials.tried.items()}
+        of_events = cls(focus, None, 0, total, readings, is_clear, pose_delay, None, focal_scale, None)
+        if not with_frames:
+            return of_events
 
         edges, plane, frame_delay, apart = FrameEdges.of(recording, (near, far), focus.largest_delay), 0, None, 0
         if edges is not None:
@@ -262,8 +292,7 @@ class Agreement:
                 apart = round((pose_delay.value - frame_delay.value) * MILLISECOND)
         tracks = FrameTracks.of(recording)
         corners = None if tracks is None else _fit_corners(tracks, near / 2, apart)
-        total = {hypothesis: float(curves.sum()) for hypothesis, curves in trials.tried.items()}
-        return cls(focus, edges, plane, total, readings, is_clear, pose_delay, frame_delay, focal_scale, corners)
+        return replace(of_events, edges=edges, plane=plane, frame_delay=frame_delay, corners=corners)
 
     def verdict(self) -> str:
         """One sentence on whether poses, clocks and calibration agree with the events."""
@@ -342,11 +371,10 @@ class Agreement:
         if AS_READ not in self.readings:
             gain = self.sharpness[Hypothesis(reading=self.readings[0])] / self.sharpness[AS_STATED]
             yield Problem(
-                f"The poses fit the events when they are read as {_either(self.readings)}: events are then {gain:.1f} "
-                "times as sharp.",
-                "State the poses camera to world, with quaternions x y z w and OpenCV's axes of the camera (x right, y "
-                "down, z forward)"
-                + ("; this motion does not show which of these readings is right." if len(self.readings) > 1 else "."),
+                f"The poses fit the events when they are read as {_either(self.readings)}: events are then "
+                f"{gain:.1f} times as sharp.",
+                f"{self._mend_of_readings()}; poses are read camera to world, with quaternions x y z w and OpenCV's "
+                "axes of the camera (x right, y down, z forward).",
             )
         elif SCALAR_FIRST in self.readings and _is_half_turn(self.focus.recording.trajectory):
             yield Problem(
@@ -355,6 +383,16 @@ class Agreement:
                 "Check the order of the quaternions and the axes, which this motion does not show. Learning is as good "
                 "either way, but the scene may stand upside down.",
             )
+
+    def _mend_of_readings(self) -> str:
+        """What to do if another reading of the poses than the one in which they were read fits the events."""
+        likeliest, *others = self.readings
+        fault = likeliest.fault_of_events and f"if the poses are right, {likeliest.fault_of_events}"
+        if others:
+            return "This motion does not show which of these readings is right" + (f"; {fault}" if fault else "")
+        if likeliest.exchanges:
+            return fault[0].upper() + fault[1:]
+        return f"{_mend(likeliest)} in their file" + (f"; or, {fault}" if fault else "")
 
     def _clock_problems(self) -> Iterator[Problem]:
         late = self._lateness()
@@ -386,7 +424,8 @@ class Agreement:
             yield Problem(
                 f"The focal length is wrong: {scale.value:.3f} ± {scale.error:.3f} of the stated one fits the events "
                 f"best, {scale.value * self.focus.recording.camera.fx:.1f} pixels.",
-                "Check the calibration, and whether it is of this lens and this resolution of the sensor.",
+                f"Multiply fx and fy of the calibration by {scale.value:.3f}, if it is of another lens or another "
+                "resolution of the sensor.",
             )
 
     def _frame_focal_problems(self) -> Iterator[Problem]:
@@ -422,6 +461,38 @@ class Agreement:
     def pixels(self, delay: float) -> float:
         """Pixels by which the picture moves during a delay (ms) while the camera is fast."""
         return abs(delay) * 1e-3 * self.focus.speed
+
+
+def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[Reading], bool, float] | None:
+    """The trials of readings of the poses; the best readings; whether they are clear; and a lens around which the focal
+    length is searched, as a multiple of the stated one.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        distance: Usual depth of the scene, metres.
+
+    Returns:
+        None if the events are too few, or the recording is too short.
+    """
+    found = None
+    for longer in LONGER_WINDOWS:
+        trials = _Trials(EventFocus(recording, longer * distance))
+        if not trials.focus.windows:
+            continue
+        tried_for_all = [Hypothesis(), Hypothesis(round(trials.delay(AS_READ, 1.0).value * MILLISECOND))]
+        other = _other_lens(trials, tried_for_all) if trials.focus.turn >= SMALLEST_TURN else None
+        tried_for_all += [] if other is None else [other]
+        heights = {
+            reading: float(trials.curve([replace(one, reading=reading) for one in tried_for_all]).sum(1).max())
+            for reading in (AS_READ, *READINGS)
+        }
+        readings, is_clear = _best_readings(recording.trajectory, heights)
+        lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
+        if found is None or is_clear:
+            found = trials, readings, is_clear, lens
+        if is_clear:
+            break
+    return found
 
 
 def shown_hypotheses() -> list[Hypothesis]:
@@ -553,6 +624,20 @@ def _best_readings(trajectory: Trajectory, heights: dict[Reading, float]) -> tup
 def _either(readings: list[Reading]) -> str:
     words = [reading.words for reading in readings[:3]]
     return ", or ".join(words) + (", or otherwise turned or mirrored" if len(readings) > 3 else "")
+
+
+def _mend(reading: Reading) -> str:
+    """Change of a file of poses in this reading to the convention in which files are read, as an instruction."""
+    if reading is INVERSE:
+        return "Invert each pose, R to its transpose R' and t to -R' t,"
+    if reading is SCALAR_FIRST:
+        return "Move the first number of each quaternion behind the other three"
+    if reading is SCALAR_LAST:
+        return "Move the last number of each quaternion before the other three"
+    signs = f"diag({', '.join(f'{sign:g}' for sign in reading.signs)})"
+    if np.prod(reading.signs) < 0:  # a rotation stays one only if an axis of the world is mirrored, too
+        return f"Mirror each pose, R to M R M and t to M t with M = {signs},"
+    return f"Multiply the rotation matrix of each pose from the right by {signs}"
 
 
 def _is_half_turn(trajectory: Trajectory) -> bool:

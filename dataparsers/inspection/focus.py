@@ -69,6 +69,10 @@ class Reading:
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Signs of the camera's axes. An odd number of negative signs mirrors the picture, or puts the scene behind the
     camera."""
+    exchanges: bool = False
+    """Whether x and y of the sensor are exchanged, before the signs count."""
+    fault_of_events: str = ""
+    """Fault of the events that has the same effect, and what to do. It can follow "if the poses are right,"."""
 
 
 def _inverse(trajectory: Trajectory) -> Trajectory:
@@ -91,14 +95,42 @@ OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1))
 INVERSE = Reading("world to camera, the inverse", _inverse)
 SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)))
 SCALAR_LAST = Reading("quaternions in the order x y z w", _reordered((3, 0, 1, 2)))
+EXCHANGED = Reading(
+    "axes of a sensor whose x and y are exchanged (x down, y right)",
+    exchanges=True,
+    fault_of_events="x and y of the events are exchanged: exchange both columns, and width and height if they are too",
+)
+FAULTS_OF_EVENTS = {
+    (-1, 1, 1): "the events are mirrored: write width - 1 - x for x",
+    (1, -1, 1): "the events are mirrored: write height - 1 - y for y",
+    (-1, -1, 1): "the events are turned by half a turn: write width - 1 - x for x, and height - 1 - y for y",
+}
+"""Faults of the events that make the same picture as these signs of the camera's axes."""
 READINGS = (
     INVERSE,
     SCALAR_FIRST,
     SCALAR_LAST,
     OPENGL,
+    EXCHANGED,
     *(
-        Reading(("mirrored " if np.prod(signs) < 0 else "") + _axes(signs), signs=signs)
+        Reading(
+            ("mirrored " if np.prod(signs) < 0 else "") + _axes(signs),
+            signs=signs,
+            fault_of_events=FAULTS_OF_EVENTS.get(signs, ""),
+        )
         for signs in ((-1, 1, 1), (1, -1, 1), (-1, -1, 1), (-1, 1, -1), (1, 1, -1), (-1, -1, -1))
+    ),
+    *(
+        Reading(
+            f"axes of a sensor that is turned by a quarter of a turn ({axes})",
+            signs=signs,
+            exchanges=True,
+            fault_of_events=f"the events are turned by a quarter of a turn: {mend}",
+        )
+        for signs, axes, mend in (
+            ((-1, 1, 1), "x down, y left", "write height - 1 - y for x, and x for y"),
+            ((1, -1, 1), "x up, y right", "write y for x, and width - 1 - x for y"),
+        )
     ),
 )
 """Other readings, the likeliest mistakes first."""
@@ -170,7 +202,7 @@ class EventFocus:
             start, end = _posed_span(recording)
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
         self._trajectories = {AS_READ: recording.trajectory}
-        self._cameras = {1.0: camera}
+        self._cameras: dict[tuple[float, bool], Camera] = {}
 
     @property
     def speed(self) -> float:
@@ -202,7 +234,7 @@ class EventFocus:
             hypothesis: Poses and calibration to compensate with; None counts events where they fired.
         """
         events = _some(window.events, EVENTS_PER_PICTURE)
-        camera = self._camera(1.0 if hypothesis is None else hypothesis.focal_scale)
+        camera = self._camera(hypothesis or AS_STATED)
         scale, focal = grid_scale(camera), grid_focal_length(camera)
         columns, rows = (round(side * scale) // TILE * TILE for side in (camera.width, camera.height))
         if hypothesis is None:
@@ -236,10 +268,12 @@ class EventFocus:
         moments = np.append(times, window.instant) + hypothesis.delay
         poses = read.poses(torch.from_numpy(moments.clip(read.start, read.end))).numpy()
         poses[:, :, :3] *= hypothesis.reading.signs
+        if hypothesis.reading.exchanges:
+            poses = poses[:, :, [1, 0, 2, 3]]
         reach = float(np.linalg.norm(poses[:, :, 3] - poses[-1, :, 3], axis=1).max())
 
         moment = np.rint((events.t - window.start) * ((len(times) - 1) / (window.end - window.start))).astype(int)
-        camera = self._camera(hypothesis.focal_scale)
+        camera = self._camera(hypothesis)
         rays, centres = rays_in_view(camera.pixel_directions()[events.y, events.x], poses[moment], poses[-1])
         planes = PLANES[grid_focal_length(camera) > NEAREST_PLANE * PLANES] if reach else PLANES[:1]
         centres = centres / (reach or 1.0)
@@ -254,20 +288,33 @@ class EventFocus:
             self._trajectories[reading] = meant if mount is None else meant.of_mounted(mount)
         return self._trajectories[reading]
 
+    @cached_property
+    def _fits_exchanged(self) -> bool:
+        """Whether events would also lie within the sensor if x and y were exchanged, and end where it would end."""
+        camera = self.recording.camera
+        index = index_events(self.recording)
+        rows, columns = np.nonzero(index.offsets.diff().numpy().reshape(camera.height, camera.width))
+        return camera.width != camera.height and columns.max() < camera.height and rows.max() < camera.width
+
     def allows(self, focal_scale: float) -> bool:
         """Whether the lens model can be inverted with this multiple of the stated focal length."""
         try:
-            self._camera(focal_scale).pixel_directions()
+            self._camera(Hypothesis(focal_scale=focal_scale)).pixel_directions()
         except ValueError:
             return False
         return True
 
-    def _camera(self, scale: float) -> Camera:
-        if scale not in self._cameras:
-            stated = self.recording.camera
+    def _camera(self, hypothesis: Hypothesis) -> Camera:
+        """The camera of a hypothesis. If x and y of the events alone are exchanged, so are fx, fy and cx, cy."""
+        scale, stated = hypothesis.focal_scale, self.recording.camera
+        turns = hypothesis.reading.exchanges and (stated.has_sides_swapped or self._fits_exchanged)
+        if (scale, turns) not in self._cameras:
             directions = None if stated.directions is None else stated.directions / scale
-            self._cameras[scale] = replace(stated, fx=stated.fx * scale, fy=stated.fy * scale, directions=directions)
-        return self._cameras[scale]
+            fx, fy, cx, cy = stated.fx * scale, stated.fy * scale, stated.cx, stated.cy
+            if turns:
+                fx, fy, cx, cy = fy, fx, cy, cx
+            self._cameras[scale, turns] = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy, directions=directions)
+        return self._cameras[scale, turns]
 
 
 def largest_delay(recording: EventRecording) -> int:

@@ -39,12 +39,12 @@ from enerf_ns.dataparsers.inspection.problems import (
 )
 from enerf_ns.dataparsers.inspection.sensor_survey import SensorSurvey
 from enerf_ns.dataparsers.recording.camera import Camera
-from enerf_ns.dataparsers.recording.errors import UserError, printable
+from enerf_ns.dataparsers.recording.errors import printable
 from enerf_ns.dataparsers.recording.files import fill_page
 from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, percent
 from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range, share_beyond
+from enerf_ns.dataparsers.scene.depth_range import UnknownDepthError, scene_depth_range, share_beyond
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 if TYPE_CHECKING:
@@ -132,11 +132,15 @@ class Inspection:
         near_far, unknown = None, []
         try:
             near_far = scene_depth_range(recording)
-        except UserError as error:
-            unknown = [Problem(str(error), "Until the range is stated, nothing can be learned from this recording.")]
+        except UnknownDepthError as error:
+            unknown = [f"The depth range of the scene cannot be measured, because {error.reason}."]
         agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
-        problems = [*(agreement.problems() if agreement else []), *sensor.problems()]
-        problems += [*find_problems(recording, near_far), *unknown]
+        contradictions = agreement.problems() if agreement else []
+        problems = [*contradictions, *sensor.problems()]
+        mend = "State the range with --depth-range NEAR FAR of the data parser (metres), which training needs."
+        if contradictions:
+            mend = "Mend the first problem of this list. The wrong poses, clock or calibration can be the cause."
+        problems += [*find_problems(recording, near_far, statistics), *(Problem(what, mend) for what in unknown)]
         as_read = recording.as_read
         as_stated = None if as_read is None else Agreement.of(as_read, near_far)
         return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated)

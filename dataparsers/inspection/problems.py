@@ -71,8 +71,11 @@ MIN_EVENTS_PER_PIXEL = 10
 """Fewest events per pixel on average, about a few grey levels. Recordings of publications have dozens."""
 
 MIN_SHARE_AT_CUT = 0.2
-"""Events in the last two columns (or rows) up to 255, as a share of the median column, above which the coordinate is
-cut to 8 bits. Fewer events may end at the border of the scene."""
+"""Events in the last two columns (or rows) with any, as a share of the median column, above which the coordinate is
+cut. Fewer events may end at the border of the scene."""
+
+MIN_SHARE_BEYOND = 0.02
+"""Least share of the columns (or rows) beyond a cut. Some sensors have a few at the border that never fire."""
 
 FLOAT_TIMES, FEWEST_FLOAT_TIMES = 2**16, 100
 """Number of event times that are tested for single precision, and fewest different ones among them."""
@@ -171,17 +174,22 @@ def event_statistics(recording: EventRecording, at_most: int | None = None) -> E
     )
 
 
-def find_problems(recording: EventRecording, depth_range: tuple[float, float] | None = None) -> list[Problem]:
+def find_problems(
+    recording: EventRecording,
+    depth_range: tuple[float, float] | None = None,
+    statistics: EventStatistics | None = None,
+) -> list[Problem]:
     """Problems of a recording, with advice. Takes seconds once the events are indexed.
 
     Args:
         recording: Its index is made if it is not there yet.
         depth_range: Nearest and farthest depth, metres. Default: the range that the recording states, if any.
+        statistics: Those of the recording. Default: they are measured here, with at most `SAMPLED_EVENTS` events.
 
     Raises:
         RecordingError: The events cannot be used.
     """
-    statistics = event_statistics(recording, SAMPLED_EVENTS)
+    statistics = statistics or event_statistics(recording, SAMPLED_EVENTS)
     depth_range = depth_range or recording.depth_range
     gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
     silences, bursts = unusual_rates(recording, statistics, depth_range)
@@ -194,6 +202,7 @@ def find_problems(recording: EventRecording, depth_range: tuple[float, float] | 
         *_rate_problems(silences, bursts, flag),
         *_count_problems(statistics),
         *_cut_coordinates(statistics),
+        *_unusual_times(recording),
         *_coarse_times(recording),
         *_frame_problems(recording.frames or recording.blurred_frames),
     ]
@@ -391,16 +400,39 @@ def _count_problems(statistics: EventStatistics) -> Iterator[Problem]:
 
 
 def _cut_coordinates(statistics: EventStatistics) -> Iterator[Problem]:
-    """Reports coordinates that were cut to 8 bits: events end at 255, as many there as elsewhere."""
+    """Reports coordinates that end before the sensor does, with as many events at the end as elsewhere."""
     for name, axis in (("x", 0), ("y", 1)):
         counts = statistics.counts.sum(axis)
-        seen, beyond = counts[:256], counts[256:]
-        if len(beyond) and not beyond.any() and seen[-2:].mean() > MIN_SHARE_AT_CUT * np.median(seen):
-            yield Problem(
-                f"No event has {name} above 255, though the sensor has {len(counts)} pixels along it, and as many "
-                f"events have {name} = 255 as other values: {name} seems to be cut to 8 bits.",
-                f"Write {name} again from the source of the events, in 16 bits (numpy.uint16).",
-            )
+        last = int(np.flatnonzero(counts).max(initial=0))
+        seen, beyond = counts[: last + 1], len(counts) - 1 - last
+        if beyond <= MIN_SHARE_BEYOND * len(counts) or seen[-2:].mean() <= MIN_SHARE_AT_CUT * np.median(seen):
+            continue
+        why, advice = (
+            "the sensor seems to be cropped",
+            "Give the calibration of the part that was read: its width and height, and cx and cy less its first column "
+            "and row.",
+        )
+        if last == 255:
+            why = f"{name} seems to be cut to 8 bits"
+            advice = f"Write {name} again from the source of the events, in 16 bits (numpy.uint16)."
+        elif last + 1 == statistics.counts.shape[axis]:
+            why = "x and y seem to be exchanged, and the events outside the sensor to be left out"
+            advice = "Write the events again from their source, with the column as x and the row as y."
+        yield Problem(
+            f"No event has {name} above {last}, though the sensor has {len(counts)} pixels along it, and as many "
+            f"events have {name} = {last} as other values: {why}.",
+            advice,
+        )
+
+
+def _unusual_times(recording: EventRecording) -> Iterator[Problem]:
+    index = index_events(recording)
+    first, last = index.span
+    if wrong := recording.unusual_units(len(index), last - first):
+        yield Problem(
+            f"The recording holds {wrong}",
+            "If the times are right, so fast or slow a recording is learned from all the same.",
+        )
 
 
 def _coarse_times(recording: EventRecording) -> Iterator[Problem]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -194,6 +195,13 @@ class Camera:
     def without_lens(self) -> Camera:
         """Returns the pinhole camera with the same focal lengths and principal point."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def has_sides_swapped(self) -> bool:
+        """Whether the principal point is closer to the middle of a picture of height x width than of width x height."""
+        middle = (self.width - 1) / 2, (self.height - 1) / 2
+        away = math.hypot(self.cx - middle[0], self.cy - middle[1])
+        return math.hypot(self.cx - middle[1], self.cy - middle[0]) < away
 
     def undistorted(self) -> Camera:
         """Returns the pinhole camera of the same size whose image holds only pixels that this camera sees.

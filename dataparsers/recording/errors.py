@@ -37,11 +37,14 @@ def exit_with_a_sentence() -> Iterator[None]:
     Raises:
         SystemExit: Replaces a `UserError`, an OSError about a file or folder, and an error about a name that is not
             text. The sentence is on one line, whatever a name in it holds. Replaces a KeyboardInterrupt, with code 130.
+        BrokenPipeError: The reader of the output has gone.
     """
     try:
         yield
     except UserError as error:
         raise SystemExit(f"enerf: {printable(str(error))}") from error
+    except BrokenPipeError:
+        raise
     except OSError as error:
         if error.errno is None:
             raise

@@ -23,6 +23,9 @@ from enerf_ns.dataparsers.recording.files import is_deep, load_image
 DEPTHS = (8, 10, 12, 14, 16)
 """Numbers of bits that a camera may have."""
 
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in the brightness that a grey sensor sees (ITU-R BT.601)."""
+
 
 @lru_cache(maxsize=16)
 def find_white_level(files: tuple[Path, ...]) -> float:

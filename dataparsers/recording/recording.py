@@ -5,7 +5,7 @@ The constructors check the values. `enerf_ns.dataparsers.formats.registry` reads
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -19,13 +19,11 @@ from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import is_deep, load_array, load_image
 from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.dataparsers.recording.pose_noise import pose_noise
+from enerf_ns.dataparsers.recording.time_units import Times, check_units, unusual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 
 EVENTS_AT_A_TIME = 2**18
 """Number of events that a reader yields at once: enough for speed, with little memory."""
-
-LARGEST_SPAN_RATIO = 300
-"""Largest ratio between the time spans of events or frames and of poses. Units of time differ by 1000."""
 
 LONGEST_REFRACTORY_PERIOD = 10**12
 """Longest refractory period, nanoseconds."""
@@ -45,10 +43,6 @@ LONGEST_EXPOSURE = 10**15
 
 SHORTEST_EXPOSURE = 1_000
 """Shortest exposure above 0, nanoseconds. Shorter ones are in another unit."""
-
-SHORTEST_FRAME_STEP = 1_000_000
-"""Shortest time between frames, nanoseconds. Closer frames are in another unit if they also span a small part of the
-poses."""
 
 
 @dataclass(frozen=True)
@@ -249,6 +243,9 @@ class EventRecording:
     """Function that returns the file and line of event number i of the stream, for error messages."""
     num_events: int | None = None
     """Number of events in the files, only to show progress; None if it is not known before reading."""
+    times_in: Mapping[str, tuple[Path, str]] = field(default_factory=dict)
+    """File and unit (s, us or ns) of the times of "events", "poses", "frames" and "blurred frames", for error messages.
+    Default: the folder, ns."""
     time_range: tuple[int, int] | None = None
     """First and last time (ns) of the selected range; None for the whole recording."""
     keep_hot_pixels: bool = False
@@ -399,6 +396,38 @@ class EventRecording:
         """Returns the recording itself, which is read-only and large; Nerfstudio copies the input of data sets."""
         return self
 
+    def check_units(self, num_events: int, span: int) -> None:
+        """Checks that events, poses and frames can be in the units in which they were read.
+
+        Args:
+            num_events: Number of all events.
+            span: Time from the first event to the last, ns.
+
+        Raises:
+            RecordingError: They cannot.
+        """
+        check_units(self.path, self._all_times(num_events, span))
+
+    def unusual_units(self, num_events: int, span: int) -> str | None:
+        """Returns what `time_units.unusual_units` says of events, poses and frames; takes what `check_units` takes."""
+        return unusual_units(self._all_times(num_events, span))
+
+    def _all_times(self, num_events: int, span: int) -> list[Times]:
+        pixels = self.camera.width * self.camera.height
+        times = [Times.of_events(*self._file_of("events"), num_events, span, pixels), self._times_of_poses]
+        kinds = {"frames": self.frames, "blurred frames": self.blurred_frames}
+        return times + [self._times_of(frames, what) for what, frames in kinds.items() if frames is not None]
+
+    @property
+    def _times_of_poses(self) -> Times:
+        return Times.of_rows("poses", *self._file_of("poses"), self.trajectory.times)
+
+    def _times_of(self, frames: Frames, what: str) -> Times:
+        return Times.of_rows("frames", *self._file_of(what), frames.times)
+
+    def _file_of(self, what: str) -> tuple[Path, str]:
+        return self.times_in.get(what, (self.path, "ns"))
+
     def _check_what_is_stated(self) -> None:
         on, off = self.contrast_thresholds or (1.0, 1.0)
         least, largest = CONTRAST_THRESHOLD_LIMITS
@@ -449,14 +478,7 @@ class EventRecording:
         """Returns the frames within the poses; adds to notes and shares if some are left out."""
         if frames is None:
             return None
-        steps, poses = np.diff(frames.times), frames.trajectory.end - frames.trajectory.start
-        too_long = steps.sum() > LARGEST_SPAN_RATIO * poses
-        too_short = len(steps) and np.median(steps) < SHORTEST_FRAME_STEP and LARGEST_SPAN_RATIO * steps.sum() < poses
-        if too_long or too_short:
-            raise RecordingError(
-                f"{self.path} holds {what} within {steps.sum() * 1e-9:.6g} s and poses within {poses * 1e-9:.6g} s, "
-                "which does not fit together; state the times of both in the unit that the format asks for."
-            )
+        check_units(self.path, [self._times_of_poses, self._times_of(frames, what)])
         inside = np.flatnonzero(frames.trajectory.covers(frames.times))
         dropped = len(frames.times) - len(inside)
         if not dropped:

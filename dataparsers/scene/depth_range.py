@@ -9,12 +9,13 @@ from functools import cache
 import numpy as np
 import torch
 from jaxtyping import Float64
+from rich import get_console
 from rich.progress import track
 
 from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
-from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, quoted
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 
@@ -54,6 +55,23 @@ MIN_CHANCE_RATIO = 3.0
 
 EVENTS_FOR_DEPTH = 4_000_000
 """Most events that measure the depth of the scene."""
+
+
+class UnknownDepthError(RecordingError):
+    """The events do not show how deep the scene is.
+
+    Args:
+        recording: Recording without a stated depth range.
+        reason: Reason as a clause, which can follow "because".
+    """
+
+    def __init__(self, recording: EventRecording, reason: str):
+        self.reason = reason
+        super().__init__(
+            f"{recording.path}: the depth range of the scene cannot be measured, because {reason}; look at it with "
+            f"enerf inspect {quoted(recording.path)}, and if its poses are right, state the range with --depth-range "
+            "NEAR FAR of the data parser (metres)."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +115,8 @@ def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | N
 
     Raises:
         FlagError: `stated` is no range.
-        RecordingError: The events do not show how deep the scene is.
+        UnknownDepthError: The events do not show how deep the scene is.
+        RecordingError: The events cannot be used.
     """
     if stated is None:
         return recording.depth_range or _measured_depth_range(recording)
@@ -111,11 +130,8 @@ def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
     parallax = recording_parallax(recording)
     if not parallax.is_shown:
         found = "the camera only turns: " if parallax.is_ruled_out else ""
-        raise RecordingError(
-            f"{recording.path}: the depth range of the scene cannot be measured, because {found}its path spans "
-            f"{parallax.extent:.3g} m, and its events show no parallax; state the range with --depth-range NEAR FAR of "
-            "the data parser (metres)."
-        )
+        reason = f"{found}its path spans {parallax.extent:.3g} m, and its events show no parallax"
+        raise UnknownDepthError(recording, reason)
     return parallax.depth_range
 
 
@@ -160,7 +176,8 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
     """
     path = _path(events, trajectory)
     extent, depths, num_by_chance, num_at_infinity = _extent(path[1]), [np.empty(0)], 0, 0
-    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True)
+    is_file = not get_console().is_terminal  # in which a bar leaves an empty line
+    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True, disable=is_file)
     planes = np.concatenate([DISPARITIES, -DISPARITIES])
     for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
         ahead, behind = np.split(sweep, 2, axis=1)

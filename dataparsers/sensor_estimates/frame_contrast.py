@@ -14,15 +14,12 @@ from scipy import ndimage
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.dataparsers.index.indexing import index_events
-from enerf_ns.dataparsers.recording.picture_depth import brightness
+from enerf_ns.dataparsers.recording.picture_depth import LUMA, brightness
 from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording, Frames
 
 DARKEST, BRIGHTEST = 20, 245
 """Darkest and brightest grey level of the pixels of frames that are used. Darker levels are rounded by more than 2.5 %,
 and not all responses are logarithms there; brighter ones may be saturated."""
-
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in the brightness that a grey sensor sees (ITU-R BT.601)."""
 
 NUM_STARTS = 24
 """Largest number of frames that others are compared to."""

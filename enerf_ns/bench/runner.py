@@ -9,7 +9,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -22,7 +21,6 @@ import numba
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
-import enerf_ns
 from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
 from enerf_ns.bench.measures import TRUTH, evaluate
@@ -33,6 +31,7 @@ from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError
 from enerf_ns.dataparsers.recording.files import absolute, expanded, partial_of, read_json, write_whole
 from enerf_ns.evaluation.lpips import NETWORKS, Net
+from enerf_ns.method.origin import code_version, device_name
 from enerf_ns.method.runs import method_config, set_up, train
 from enerf_ns.method.stopwatch import seconds_of
 from enerf_ns.method.trainer import EnerfTrainerConfig
@@ -419,27 +418,6 @@ def hide_sensor(recording: Path) -> None:
             stated = read_json(recording / name)
             kept = {name: value for name, value in stated.items() if name not in STATED_OF_SENSOR}
             write_whole(recording / name, json.dumps(kept, indent=2) + "\n")
-
-
-def code_version() -> str:
-    """Version of the package, with the commit if it runs from its repository, and -dirty if files were changed."""
-    root = Path(enerf_ns.__file__).parents[1]
-
-    def git(*arguments: str) -> str:
-        asked = subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True, check=True)
-        return asked.stdout.strip()
-
-    try:
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != root.resolve():
-            return enerf_ns.__version__
-        return f"{enerf_ns.__version__}+{git('describe', '--always', '--dirty', '--abbrev=10', '--exclude=*')}"
-    except (OSError, subprocess.CalledProcessError):
-        return enerf_ns.__version__
-
-
-def device_name() -> str:
-    """Name of the default training device."""
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
 
 
 def _some(flag: str, chosen: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ import math
 
 from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import DATAPARSER, Scene
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range, share_beyond
+from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not_explained
+from enerf_ns.dataparsers.scene.depth_range import share_beyond
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 SHARE_BEYOND = 0.05
@@ -48,7 +49,14 @@ def box(scene: Scene) -> None:
 
 def depths(scene: Scene) -> tuple[float, float]:
     """Nearest and farthest depth of the scene, m."""
-    return scene_depth_range(scene.once(corrected_recording), scene.value(f"{DATAPARSER}.depth_range"))
+    stated = scene.value(f"{DATAPARSER}.depth_range")
+    return depth_range_or_cause(scene.once(corrected_recording), stated, scene.recording)
+
+
+def explainable(scene: Scene) -> None:
+    """Can poses, calibration and depth range explain the events? If not, the answer is the `cause`, and no row."""
+    if scene.use_events:
+        scene.cause = why_not_explained(scene.once(corrected_recording), scene.once(depths), scene.recording) or ""
 
 
 def scale(scene: Scene) -> float:

@@ -124,6 +124,12 @@ class Resolution:
     """A row for each part of the method."""
     selection: tuple[str, ...] = ()
     """Notes about the preset, one sentence each."""
+    summary: tuple[str, ...] = ()
+    """Sentences on the data that the field learns from, on what is assumed, and on what is learned beside it."""
+    flags_to_state: tuple[str, ...] = ()
+    """Flags of `ns-train` that state what the recording does not."""
+    cause: str = ""
+    """Likely cause why the events cannot be explained, as a clause; empty if nothing is known to be wrong."""
 
     def applied_to(self, config: ConfigT) -> ConfigT:
         """A copy of a pipeline's config in which the open settings are filled in."""

@@ -15,6 +15,7 @@ from typing import Any
 from enerf_ns.choices import brightness, events, extent, frames, poses, rays, sensor
 from enerf_ns.choices.resolution import PipelineConfig, Resolution
 from enerf_ns.choices.scene import Scene
+from enerf_ns.choices.summary import flags_to_state, in_words
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 ROWS: tuple[Callable[[Scene], None], ...] = (
@@ -37,6 +38,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     brightness.colour,
     extent.undistortion,
     extent.box,
+    extent.explainable,
     extent.contraction,
     frames.exposure,
     extent.hash_grid,
@@ -77,4 +79,6 @@ def resolve(
         row(scene)
     rays.view_direction(scene, probe)
     rays.larger_batch(scene, batch_factor)
-    return Resolution(scene.values, tuple(scene.choices), tuple(scene.selection))
+    return Resolution(
+        scene.values, tuple(scene.choices), tuple(scene.selection), in_words(scene), flags_to_state(scene), scene.cause
+    )

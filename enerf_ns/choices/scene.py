@@ -49,6 +49,8 @@ class Scene:
         self.choices: list[Choice] = []
         self.selection: list[str] = []
         """Notes about the preset."""
+        self.cause = ""
+        """Likely cause why the events cannot be explained, as a clause; empty if nothing is known to be wrong."""
         self.preset_values: dict[str, Any] = {}
         self._found: dict[Callable[[Scene], Any], Any] = {}
         if preset is not None:

@@ -1,7 +1,8 @@
-"""Tables that training prints: the recording, the choices, and the errors of clock, poses and lens."""
+"""Output of training on the recording, the choices, and the errors of clock, poses and lens."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 from rich.table import Table
@@ -58,33 +59,36 @@ def recording_table(parser: EventDataParserConfig) -> Table:
     return table
 
 
-def choices_table(choices: Sequence[Choice]) -> Table:
-    """The table of choices: the parts of the method, whether each is kept, why, and the flag that forces it."""
-    caption = f"forced by {PREFIX}FLAG VALUE, those of event-data at the end"
-    table = _table("Parts of the method", caption, ("part", "", "what", "why", "flag"))
+def choices_text(choices: Sequence[Choice], columns: int) -> str:
+    """The choices as text: the parts of the method, whether each is kept, why, and the flag that forces it.
+
+    Args:
+        choices: The rows.
+        columns: Width of the lines. A flag is never broken.
+    """
+
+    def lines(text: str, indent: str = "    ") -> list[str]:
+        return textwrap.wrap(text, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+
+    found = []
     for choice in choices:
-        kept = "[green]kept[/green]" if choice.kept else "[dim]left out[/dim]"
-        flag = Text(choice.flag.removeprefix(PREFIX), "dim")
-        table.add_row(choice.part, kept, Text(choice.value), Text(choice.why), flag)
-    return table
+        value = f": {choice.value}" if choice.value else ""
+        found += lines(f"{choice.part}, {'kept' if choice.kept else 'left out'}{value}")
+        found += [*lines(f"    because {choice.why}"), f"    {choice.flag}", ""]
+    return "\n".join(found)
 
 
 def findings_table(found: Sequence[Finding]) -> Table:
     """The table of the errors of clock, poses and lens, and the distance (pixels) by which each moves the picture."""
     caption = f"forced or forbidden by {PREFIX}FLAG True or False"
-    table = _table("Clock, poses and lens", caption, ("part", "", "found", "moves the picture by", "flag"))
+    table = Table(title="Clock, poses and lens", caption=caption)
+    table.title_justify = table.caption_justify = "left"
+    for column in ("part", "", "found", "moves the picture by"):
+        table.add_column(column, overflow="fold")
+    table.add_column("flag", no_wrap=True)
     for row in found:
         kept = "[green]corrected[/green]" if row.is_corrected else "[dim]as stated[/dim]"
         value = row.value if row.is_identifiable else f"not identifiable ({row.value})"
         moved = f"{row.pixels:.2g} pixels" if row.is_corrected else ""
         table.add_row(row.what, kept, Text(value), moved, Text(row.flag.removeprefix(PREFIX), "dim"))
-    return table
-
-
-def _table(title: str, caption: str, columns: Sequence[str]) -> Table:
-    """An empty table whose cells may have several lines."""
-    table = Table(title=title, caption=caption)
-    table.title_justify = table.caption_justify = "left"
-    for column in columns:
-        table.add_column(column, overflow="fold")
     return table

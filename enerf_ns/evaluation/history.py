@@ -41,6 +41,8 @@ class HistoryRow:
     """Missing scores with their reasons."""
     protocol: str = ""
     """Name of the protocol in `enerf_ns.evaluation.protocols`."""
+    verdict: str = ""
+    """Sentence of the `enerf_ns.evaluation.verdict` on whether the events are explained; empty without events."""
 
 
 def append_row(folder: Path, row: HistoryRow) -> None:

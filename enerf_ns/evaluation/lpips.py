@@ -1,21 +1,21 @@
-"""LPIPS with AlexNet or VGG (Zhang et al., CVPR 2018). Weights are loaded on first use."""
+"""LPIPS with AlexNet or VGG (Zhang et al., CVPR 2018). Weights are read from a file on first use."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 from pickle import UnpicklingError
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from enerf_ns.dataparsers.recording.errors import OutputError
 from enerf_ns.evaluation.metrics import NOT_FINITE, Score
 
 if TYPE_CHECKING:
@@ -47,49 +47,77 @@ NETWORKS: dict[Net, Network] = {
 
 
 @functools.cache
-def load_lpips(net: Net) -> LearnedPerceptualImagePatchSimilarity | None:
-    """The metric of a network. If its weights cannot be loaded, None, and a line with the reason is printed."""
+def load_lpips(net: Net) -> LearnedPerceptualImagePatchSimilarity | str:
+    """The metric of a network, or the reason why it cannot be made. Nothing is downloaded."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+    from torchvision.models import get_model_weights
 
     network = NETWORKS[net]
-    path = os.environ.get(network.weights_variable)
+    variable = network.weights_variable
     try:
-        with _at_hand(network, Path(path)) if path is not None else nullcontext():
+        weights = _weights(network)
+        with patch.object(get_model_weights(network.model), "get_state_dict", lambda *_, **__: weights):
             return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True)
     except (OSError, EOFError, KeyError, TypeError, RuntimeError, UnpicklingError) as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        print(
-            f"{network.score} is left out: the weights of {network.model} could not be loaded ({reason}); set "
-            f"{network.weights_variable} to a file with the state dict of torchvision's {network.model}().features."
-        )
-        return None
+        if variable in os.environ:
+            found = "is missing" if isinstance(error, FileNotFoundError) else "does not hold its weights"
+            return f"the file of {variable}, {os.environ[variable]}, {found}"
+        found = "are not here" if isinstance(error, FileNotFoundError) else "cannot be read"
+        return f"its weights {found}; get them by enerf fetch-lpips {net}"
 
 
-@contextmanager
-def _at_hand(network: Network, features: Path) -> Iterator[None]:
-    """Makes torchvision load these features instead of a download. The unused classifier is filled with zeros."""
-    from torchvision.models import get_model, get_model_weights
+def _weights(network: Network) -> dict[str, Tensor]:
+    """The state dict of a network, from the file of its variable or of torchvision. The classifier of the former, which
+    LPIPS does not use, is filled with zeros."""
+    from torchvision.models import get_model
 
-    published: Any = get_model_weights(network.model)
-    weights = torch.load(features, map_location="cpu", weights_only=True)
+    path = os.environ.get(network.weights_variable)
+    weights = torch.load(path or torchvision_file(network), map_location="cpu", weights_only=True)
+    if path is None:
+        return weights
     with torch.device("meta"):
         layers = get_model(network.model, weights=None).state_dict()
-    state = {
+    return {
         name: weights[name.removeprefix("features.")]
         if name.startswith("features.")
-        else torch.zeros(()).expand(layer.shape)  # stored as one number
+        else torch.zeros(()).expand(layer.shape)  # which needs no memory
         for name, layer in layers.items()
     }
-    hub = torch.hub.get_dir()
-    with TemporaryDirectory() as folder:
-        file = Path(folder, "checkpoints", Path(published.DEFAULT.url).name)
-        file.parent.mkdir()
-        torch.save(state, file)
-        torch.hub.set_dir(folder)
+
+
+def torchvision_file(network: Network) -> Path:
+    """The file in which torchvision keeps the weights of a network. It may not be there."""
+    from torchvision.models import get_model_weights
+
+    published: Any = get_model_weights(network.model)
+    return Path(torch.hub.get_dir(), "checkpoints", Path(published.DEFAULT.url).name)
+
+
+def fetch_weights(net: Net) -> Path:
+    """Downloads the weights of a network to torchvision's file, and returns its path. Weights that are there stay.
+
+    Raises:
+        OutputError: They cannot be downloaded or written.
+    """
+    from torchvision.models import get_model_weights
+
+    file, published = torchvision_file(NETWORKS[net]), cast("Any", get_model_weights(NETWORKS[net].model)).DEFAULT
+    try:
         try:
-            yield
-        finally:
-            torch.hub.set_dir(hub)
+            torch.load(file, map_location="cpu", weights_only=True)
+        except (EOFError, RuntimeError, UnpicklingError):
+            file.unlink()
+        except FileNotFoundError:
+            pass
+        published.get_state_dict(progress=True, check_hash=True)
+    except BrokenPipeError:
+        raise
+    except (OSError, HTTPException, RuntimeError) as error:
+        raise OutputError(
+            f"{published.url} could not be downloaded to {file} ({getattr(error, 'reason', error)}); download it where "
+            "there is a network, and copy it there."
+        ) from error
+    return file
 
 
 def lpips(
@@ -102,8 +130,8 @@ def lpips(
     if min(rendered.shape[:2]) < side:
         return f"the frame is smaller than {side} x {side} pixels"
     metric = load_lpips(net)
-    if metric is None:
-        return "its weights could not be loaded"
+    if isinstance(metric, str):
+        return metric
     pictures = [image.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for image in (rendered, recorded)]
     with torch.no_grad():
         distance = float(metric(*pictures))

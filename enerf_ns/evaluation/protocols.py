@@ -286,7 +286,7 @@ def described(protocol: str) -> str:
     """
     if protocol == EVENTS_PROTOCOL:
         return (
-            "Protocol events: there are no frames. Rendered changes of log brightness are compared with those that "
-            "pairs of held-out events measured, without correction."
+            "Protocol events: Rendered changes of log brightness are compared with those that pairs of held-out events "
+            "measured, without correction."
         )
     return f"Protocol {protocol}: {PROTOCOLS[protocol].description}"

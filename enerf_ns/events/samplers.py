@@ -209,6 +209,10 @@ class HeldOutPairSampler:
         if not len(self._pairs):
             raise ValueError(f"no pixel fired twice, {max_distance} events apart or less, in the time that is held out")
 
+    def __len__(self) -> int:
+        """Number of different pairs."""
+        return len(self._pairs)
+
     def sample(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
         """Draws `batch_size` pairs with replacement, with the arguments of `EventPairSampler.sample`."""
         chosen = torch.randint(len(self._pairs), (batch_size,), generator=generator, device=self._pairs.device)

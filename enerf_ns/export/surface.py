@@ -26,6 +26,9 @@ SURE = 0.3
 """Confidence from which depth is fused. It is lower than for scores, because views are averaged. Between 0.5 and 0.05,
 a lower value makes the surface more complete and less accurate. The Chamfer distance is least at 0.15 to 0.3."""
 
+VOXEL_PIXELS = 1.5
+"""Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
+
 TRUNCATION = 4.0
 """Truncation distance of the signed distance function, in voxels."""
 

@@ -14,6 +14,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from enerf_ns.choices.resolution import MethodDefaults
+from enerf_ns.flags import speak_for_methods
 from enerf_ns.method.datamanager import EnerfDataManagerConfig
 from enerf_ns.method.model import EnerfModelConfig
 from enerf_ns.method.pipeline import EnerfPipelineConfig
@@ -161,3 +162,7 @@ enerf_paper = MethodSpecification(
     ),
     description="E-NeRF with the sampling and field of the paper (Klenk et al., RA-L 2023).",
 )
+
+METHODS = (enerf, enerf_paper, enerf_paper_loss, enerf_eventnerf, enerf_robust, enerf_deblur)
+
+speak_for_methods(EnerfTrainerConfig, [method.config.method_name or "" for method in METHODS])  # ns-train calls no more

@@ -11,7 +11,6 @@ from typing import Any, Literal, Optional, Tuple, Type  # noqa: UP035 - tyro rea
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -110,7 +109,7 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     rendered in the middle of the exposure. Default: as many as the motion blur needs, where exposures are known."""
     pixel_sampler: Suppress[PixelSamplerConfig] = field(default_factory=PixelSamplerConfig)
 
-    corrections: Fixed[Optional[Corrections]] = None  # noqa: UP045
+    corrections: Fixed[Any] = None  # `Corrections`; tyro would make sub-commands of a union with a dataclass
     """Corrections of the poses in a run that was loaded, for data managers that are made of its config later, as by
     `ns-render dataset`."""
 
@@ -124,7 +123,7 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     eval_num_times_to_repeat_images: Fixed[int] = -1
     eval_image_indices: Fixed[Optional[Tuple[int, ...]]] = (0,)  # noqa: UP006, UP045
     patch_size: Fixed[int] = 1
-    camera_optimizer: Fixed[Optional[CameraOptimizerConfig]] = None  # noqa: UP045
+    camera_optimizer: Fixed[Any] = None
 
 
 class EnerfDataManager(VanillaDataManager[EventDataset]):

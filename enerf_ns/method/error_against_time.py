@@ -17,13 +17,14 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.colormaps import apply_depth_colormap
 from torch import Tensor
 
-from enerf_ns.dataparsers.recording.errors import UserError
+from enerf_ns.dataparsers.recording.errors import UserError, printable
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
 from enerf_ns.evaluation.lpips import lpips
 from enerf_ns.evaluation.metrics import ssim
 from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, EVENTS_PROTOCOL
 from enerf_ns.evaluation.scores import NotScored, mean_scores, summary_scores
+from enerf_ns.evaluation.verdict import FEW_STEPS, Verdict, verdict_on_events
 from enerf_ns.evaluation.views import png
 from enerf_ns.method.checkpoints import random_state, set_random_state
 from enerf_ns.method.held_out_views import held_out_view, held_out_views
@@ -98,7 +99,11 @@ class ErrorAgainstTime:
         """Time (s) of all training steps, without evaluation, checkpoints and the viewer."""
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
         """Seconds of each evaluation, by its kind."""
+        self.verdict: Verdict | None = None
+        """Verdict of the last evaluation; None before the first, and if the field does not learn from events."""
+        self._is_said = False
         self._line = StatusLine()
+        self._first = 0  # step of this session
         self._durations: deque[float] = deque(maxlen=STEPS_MEASURED)
         self._parts: dict[str, float] = {}
         self._is_due = False
@@ -128,6 +133,7 @@ class ErrorAgainstTime:
         """
         if state is not None:
             self.seconds, self.costs = state["seconds"], state["costs"]
+        self._first = steps_done
         rows = cut_history(self.folder, steps_done)
         self._last = rows[-1] if rows else None
         if not self.share:
@@ -137,7 +143,8 @@ class ErrorAgainstTime:
             if dataset.are_frames:
                 picture = torch.zeros(64, 64, 3)
                 ssim(picture, picture)
-                lpips(picture, picture)
+                if isinstance(missing := lpips(picture, picture), str):
+                    print(printable(f"No lpips: {missing}."))
             self.pipeline.eval()
             held_out_view(
                 self.pipeline, self._numbers[0], min(dataset.frames.camera.height, dataset.frames.camera.width)
@@ -156,8 +163,10 @@ class ErrorAgainstTime:
         if timed:
             watch.lap("optimiser")
             self._parts = watch.stop()
-        self._durations.append(time.perf_counter() - begin)
-        self.seconds += self._durations[-1]
+        taken = time.perf_counter() - begin
+        self.seconds += taken
+        if number > self._first:  # which compiles
+            self._durations.append(taken)
 
     def after_step(self, number: int, metrics: dict[str, Tensor]) -> None:
         """Evaluates if a moment has come, and updates the line of progress.
@@ -255,12 +264,25 @@ class ErrorAgainstTime:
         not_scored |= {name: {why: []} for name, why in found.items() if isinstance(why, str)}
         scores = {name: float(score) for name, score in found.items() if isinstance(score, (int, float))}
         losses = {name: float(loss) for name, loss in pipeline.last_step.losses.items()}
+        self._judge(found, done, final)
+        words = self.verdict.sentence if self.verdict else ""
         self._last = HistoryRow(
-            done, self.seconds, losses, scores, len(views), self._parts, final, not_scored, protocol
+            done, self.seconds, losses, scores, len(views), self._parts, final, not_scored, protocol, words
         )
         for name, score in scores.items():
             writer.put_scalar(f"Held-out/{name}", score, done)
         append_row(self.folder, self._last)
+
+    def _judge(self, scores: dict[str, Any], done: int, final: bool) -> None:
+        """Judges whether the events are explained. During training it is printed once that they are not."""
+        manager, config = self.pipeline.datamanager, self.pipeline.config
+        if "events" not in manager.config.supervision:
+            return
+        pairs, path = self.pipeline.num_scored_pairs, manager.recording.path
+        self.verdict = verdict_on_events(scores, pairs, done, config.resolution.cause, path)
+        if self.verdict.explained == "no" and not final and done >= FEW_STEPS and not self._is_said:
+            self._is_said = True
+            say(f"Step {done}: {self.verdict.sentence}")
 
     def _preview(self, done: int) -> None:
         """Stores a picture of the first frame that moments score, its render, aligned alone, and its depth."""
@@ -277,13 +299,16 @@ class ErrorAgainstTime:
     def _status(self, done: int) -> str:
         """The line of progress. Its event correlation is a running mean over training pairs."""
         loss = sum(float(loss) for loss in self.pipeline.last_step.losses.values())
-        parts = [f"step {done} of {self.num_steps}", f"loss {loss:.4g}"]
+        parts = [f"step {done} of {self.num_steps}"]
+        if done < self.num_steps and self._durations:
+            parts.append(f"{duration(self._total(done) - self.seconds)} left")  # first, since a terminal may be narrow
+        parts.append(f"loss {loss:.4g}")
         if self._correlation is not None:
             parts.append(f"event correlation {float(self._correlation):.3f} (training pairs)")
         if self._last is not None and "psnr" in self._last.scores:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
             parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
-        if done < self.num_steps:
-            parts.append(f"{duration(self._total(done) - self.seconds)} left")
+        if self.verdict is not None and self.verdict.explained == "no":
+            parts.append(self.verdict.short)
         return ", ".join(parts)

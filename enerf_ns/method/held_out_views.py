@@ -100,7 +100,13 @@ def held_out_views(
     dataset = manager.eval_dataset
     start = time.perf_counter()
     chosen = range(len(dataset)) if numbers is None else numbers
-    shown = track(chosen, "Rendering held-out frames", console=CONSOLE, transient=True, disable=numbers is not None)
+    shown = track(
+        chosen,
+        "Rendering held-out frames",
+        console=CONSOLE,
+        transient=True,
+        disable=numbers is not None or not CONSOLE.is_terminal,
+    )
     views = [held_out_view(pipeline, number, reduced_by) for number in shown]
     seconds = time.perf_counter() - start
     if evidence:

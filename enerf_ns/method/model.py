@@ -189,6 +189,8 @@ class EnerfModel(Model):
     """Largest number of samples at which the field is evaluated at once; None for all (`enerf_ns.method.memory`)."""
     seen_volume: Callable[[], SeenVolume] | None = None
     """Returns the volume that the camera of the events saw; None for a model without a recording."""
+    display: Callable[[Tensor], Tensor] | None = None
+    """Returns brightness as a screen should show it; None for a model without a recording."""
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -485,10 +487,16 @@ class EnerfModel(Model):
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Outputs of a camera for the viewer and ns-render. Brightness is clipped to 1, since their conversion to 8
-        bits would wrap round."""
+        """Outputs of a camera for the viewer and ns-render.
+
+        rgb is linear brightness, clipped to 1, since their conversion to 8 bits would wrap round. display is brightness
+        as in the pictures of `enerf report`, and is computed when it is read.
+        """
         outputs = super().get_outputs_for_camera(camera, obb_box)
-        outputs["rgb"] = outputs["rgb"].clamp(max=1.0)
+        rgb, display = outputs["rgb"], self.display
+        if display is not None:
+            outputs["display"] = lambda: display(rgb)  # type: ignore[assignment]
+        outputs["rgb"] = rgb.clamp(max=1.0)
         return outputs
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:

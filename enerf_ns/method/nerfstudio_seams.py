@@ -1,4 +1,4 @@
-"""The seams to Nerfstudio, viser and torch: everything that this package uses of them beyond their public interfaces.
+"""The seams to Nerfstudio, viser, torch and tyro: all that this package uses of them beyond their public interfaces.
 
 Functions here reach into a package where it has no public way. `SEAMS` lists these places, and those of overridden
 methods and of the rooms below. tests/method/test_nerfstudio_seams.py walks the list: after an update of a package it
@@ -36,7 +36,7 @@ class Seam:
     """Names of the parameters of a function or method; None for anything else."""
 
 
-READ_IN = {"nerfstudio": "1.1.5", "viser": "0.2.7", "torch": "2.11.0"}
+READ_IN = {"nerfstudio": "1.1.5", "viser": "0.2.7", "torch": "2.11.0", "tyro": "1.0.17"}
 """Version of each package in which its seams were read."""
 
 SAMPLER_COUNTERS = ("_step", "_steps_since_update")
@@ -47,11 +47,13 @@ _SAMPLERS = "nerfstudio.model_components.ray_samplers"
 _RENDERER = "nerfstudio.viewer.render_state_machine:RenderStateMachine"
 _PANEL = "nerfstudio.viewer.control_panel:ControlPanel"
 _ENCODING = "nerfstudio.field_components.encodings:HashEncoding"
+_HELP = "tyro._backends._tyro_help_formatting"
 
 SEAMS = (
     # private methods that are overridden
     Seam(f"{_TRAINER}._after_train", "method.trainer ends an interrupted run here, and prints the end", ("self",)),
-    Seam(f"{_TRAINER}._train_complete_viewer", "method.trainer lets Ctrl-C end the viewer after training"),
+    Seam(f"{_TRAINER}._train_complete_viewer", "method.trainer waits later, after its last lines"),
+    Seam(f"{_TRAINER}._update_viewer_state", "method.trainer lets the viewer look at the step by itself"),
     Seam(
         "nerfstudio.data.dataparsers.base_dataparser:DataParser._generate_dataparser_outputs",
         "dataparsers.event_dataparser makes the outputs of a recording",
@@ -62,8 +64,13 @@ SEAMS = (
         "method.viewer.scene_view starts here; the viewer finds it among the attributes of the pipeline",
         ("self", "viewer"),
     ),
-    Seam(f"{_RENDERER}._render_img", "method.viewer.view_renderer renders a view", ("self", "camera_state")),
-    Seam(f"{_RENDERER}._calculate_image_res", "method.viewer.view_renderer chooses the size", ("self", "aspect_ratio")),
+    Seam(f"{_RENDERER}.run", "method.viewer.view_renderer renders in a loop of its own", ("self",)),
+    Seam(f"{_RENDERER}.action", "method.viewer.view_renderer takes note of moves", ("self", "action")),
+    Seam(
+        f"{_RENDERER}._send_output_to_viewer",
+        "method.viewer.view_renderer sends a picture",
+        ("self", "outputs", "static_render"),
+    ),
     # public methods that are overridden, and that Nerfstudio's commands call for something else
     Seam(f"{_EXPERIMENT}.save_config", "method.trainer resolves the config and prints its tables here", ("self",)),
     Seam(f"{_EXPERIMENT}.print_to_terminal", "method.trainer prints nothing here", ("self",)),
@@ -101,12 +108,13 @@ SEAMS = (
     Seam(f"{_SAMPLERS}:PDFSampler.histogram_padding", "rendering.ray_samplers pads weights as Nerfstudio does"),
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn", "rendering.ray_samplers spaces samples as Nerfstudio does"),
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn_inv", "rendering.ray_samplers spaces samples as Nerfstudio does"),
-    *(
-        Seam(f"{_RENDERER}.{name}", "method.viewer.view_renderer")
-        for name in ("transitions", "state", "interrupt_render_flag", "check_interrupt")
-    ),
+    *(Seam(f"{_RENDERER}.{name}", "method.viewer.view_renderer") for name in ("check_interrupt", "client")),
     *(Seam(f"{_RENDERER}.{name}", "replace_renderer") for name in ("running", "render_trigger")),
-    Seam("nerfstudio.viewer_legacy.server.viewer_utils:SetTrace", "method.viewer.view_renderer interrupts a render"),
+    *(
+        Seam(f"nerfstudio.viewer_legacy.server.viewer_utils:{name}", "method.viewer.view_renderer interrupts a render")
+        for name in ("SetTrace", "IOChangeException")
+    ),
+    Seam("nerfstudio.viewer.viewer:Viewer.make_stats_markdown", "method.viewer.view_renderer says the step"),
     Seam("nerfstudio.viewer.viewer:Viewer.render_statemachines", "replace_renderer, method.viewer.scene_view"),
     *(
         Seam(f"nerfstudio.viewer.viewer:Viewer.{name}", "method.viewer.scene_view")
@@ -122,6 +130,21 @@ SEAMS = (
     Seam("nerfstudio.field_components.mlp:MLP.layers", "kernels.network and network_numba read the weights"),
     Seam("nerfstudio.utils.rich_utils:CONSOLE", "terminal.without_chatter replaces print and log within a block"),
     *(Seam(f"torch.optim.adam:Adam.{name}", "leave_out_fused_step") for name in ("found_inf", "grad_scale")),
+    # without which flags.speak_for_methods leaves help and errors to tyro
+    Seam(
+        f"{_HELP}:format_help",
+        "flags groups the flags of this package's methods",
+        ("prog", "parser_spec", "args", "subparser_frontier", "verbose"),
+    ),
+    Seam(
+        f"{_HELP}:unrecognized_args_error",
+        "flags names the nearest flag",
+        (
+            *("prog", "unrecognized_args_and_progs", "subparser_frontier", "args", "parser_spec"),
+            *("console_outputs", "add_help"),
+        ),
+    ),
+    Seam("tyro._arguments:generate_argument_helptext", "flags shows the text of a flag", ("arg", "lowered", "compact")),
 )
 """All seams, those of this module and those of others."""
 

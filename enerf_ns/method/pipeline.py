@@ -25,13 +25,14 @@ from enerf_ns.dataparsers.recording.errors import FlagError, exit_with_a_sentenc
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
+from enerf_ns.evaluation.display import Display, shown_numbers
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
-from enerf_ns.evaluation.protocols import described
+from enerf_ns.evaluation.protocols import EVENTS_PROTOCOL, described
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views, save_pictures
 from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.method.datamanager import EnerfDataManager, EnerfDataManagerConfig
-from enerf_ns.method.held_out_views import held_out_views, scores_at_stated_poses
+from enerf_ns.method.held_out_views import held_out_view, held_out_views, scores_at_stated_poses
 from enerf_ns.method.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.method.model import EnerfModel, EnerfModelConfig
 from enerf_ns.method.stopwatch import Stopwatch
@@ -50,10 +51,10 @@ from enerf_ns.poses.refiner import (
 from enerf_ns.quiet import silence_known_warnings
 from enerf_ns.rendering.seen_volume import SeenVolume
 from enerf_ns.supervision.event_supervision import brightness_change
-from enerf_ns.terminal import say
+from enerf_ns.terminal import say, say_where
 
 if TYPE_CHECKING:
-    from nerfstudio.viewer.viewer_elements import ViewerControl
+    from enerf_ns.method.viewer.scene_view import SceneView
 
 SLOPE_PAIRS = 64
 """Number of pairs of a step at which slopes of brightness are rendered: enough to learn one number, the lag."""
@@ -132,6 +133,7 @@ class EnerfPipeline(VanillaPipeline):
     last_step: TrainStep
     """The last training step; not set before the first."""
     _seen: tuple[int, SeenVolume] | None = None
+    _display: Display | None = None
 
     def __init__(
         self, config: EnerfPipelineConfig, device: str, world_size: int = 1, local_rank: int = 0, **kwargs: Any
@@ -153,8 +155,8 @@ class EnerfPipeline(VanillaPipeline):
         if "events" in config.datamanager.supervision and world_size == 1:
             self.poses = PoseRefiner(config.poses, self.datamanager.recording)
             self._correct_poses()
-        self._viewer: ViewerControl | None = None
-        self.model.seen_volume = self.seen_volume
+        self._viewer: SceneView | None = None
+        self.model.seen_volume, self.model.display = self.seen_volume, self.shown
         self.world_size = world_size
         if world_size > 1:  # here, since Nerfstudio takes every device for a GPU
             gpus = [local_rank] if torch.device(device).type == "cuda" else None
@@ -167,7 +169,7 @@ class EnerfPipeline(VanillaPipeline):
         return super().model  # type: ignore
 
     @property
-    def viewer(self) -> ViewerControl:
+    def viewer(self) -> SceneView:
         """The control that adapts Nerfstudio's viewer to the recording. The viewer finds it among the attributes of the
         pipeline."""
         if self._viewer is None:
@@ -183,6 +185,26 @@ class EnerfPipeline(VanillaPipeline):
             manager = self.datamanager
             self._seen = steps, SeenVolume.of(self.model, manager.recording, manager.index, manager.event_camera)
         return self._seen[1]
+
+    @torch.no_grad()
+    def shown(self, rgb: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+        """A picture of brightness as a screen should show it, as `enerf report` does.
+
+        The display is made of some held-out frames when it is first needed, and a line says which it is.
+        """
+        if self._display is None:
+            was_training = self.training
+            self.eval()
+            numbers = shown_numbers(len(self.datamanager.eval_dataset))
+            self._display = Display.of_views([held_out_view(self, number) for number in numbers])
+            self.train(was_training)
+            height, width = rgb.shape[:2]
+            say_where(
+                "display",
+                f"{self._display.gamma}, as in enerf report; {width} x {height} pixels, of which a smaller "
+                "--downscale-factor makes more",
+            )
+        return self._display.shown(rgb)
 
     def _fit_memory(self, trains: bool) -> None:
         """Evaluates the field in parts if a training step, or a chunk of a picture, would not fit the memory.
@@ -337,6 +359,13 @@ class EnerfPipeline(VanillaPipeline):
         self.train()
         return results
 
+    @property
+    def num_scored_pairs(self) -> int:
+        """Number of different pairs of events that `event_scores` draws from, or of all events if none are held out."""
+        manager = self.datamanager
+        sampler = manager.held_out_pair_sampler if manager.config.held_out_events else manager.index
+        return 0 if isinstance(sampler, str) else len(sampler)
+
     @torch.no_grad()
     def event_scores(self, num_pairs: int = 2048) -> dict[str, Score]:
         """The scores of the protocol "events" over random pairs of held-out events.
@@ -390,6 +419,8 @@ class EnerfPipeline(VanillaPipeline):
         CONSOLE.print(described(protocol), soft_wrap=True, highlight=False, markup=False)
         not_scored: Any = scores.pop("not_scored", {})
         for name, reasons in not_scored.items():
+            if protocol == EVENTS_PROTOCOL and name not in EVENT_SCORES:
+                continue  # the description of the protocol says that there are no frames
             for reason, numbers in reasons.items():
                 of = f" of {len(numbers)} of {len(views)} frames ({', '.join(map(str, numbers))})" if numbers else ""
                 CONSOLE.print(f"No {name}{of}: {reason}.", soft_wrap=True, highlight=False, markup=False)

@@ -75,7 +75,7 @@ def _error(config: str, optimizer: str, device: str, view_direction: bool, seed:
         pipeline: EnerfPipeline = short._target(short, device=device, test_mode="val")
         adam = yaml.load(optimizer, Loader=yaml.Loader).setup(params=pipeline.model.get_param_groups()["fields"])
         what = f"Probe {seed + 1} of {SEEDS} {'with' if view_direction else 'without'} the viewing direction"
-        for _ in track(range(STEPS), what, console=CONSOLE, transient=True):
+        for _ in track(range(STEPS), what, console=CONSOLE, transient=True, disable=not CONSOLE.is_terminal):
             adam.zero_grad()
             torch.stack([*_losses(pipeline, held_out=False).values()]).sum().backward()
             adam.step()

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
+import time
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType
@@ -22,13 +24,14 @@ from nerfstudio.utils.comms import is_main_process
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
+from rich.rule import Rule
 from rich.text import Text
 from torch import Tensor
 from tyro.conf import Fixed
 
 from enerf_ns.choices.ranges import check_ranges
 from enerf_ns.choices.resolver import resolve
-from enerf_ns.choices.table import choices_table, findings_table, recording_table
+from enerf_ns.choices.table import choices_text, findings_table, recording_table
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import (
@@ -36,7 +39,6 @@ from enerf_ns.dataparsers.recording.errors import (
     OutputError,
     RecordingError,
     exit_with_a_sentence,
-    printable,
     quoted,
 )
 from enerf_ns.dataparsers.recording.files import absolute, write_together, write_whole
@@ -66,15 +68,19 @@ from enerf_ns.method.guarded_steps import (
 )
 from enerf_ns.method.model import EnerfModel
 from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
+from enerf_ns.method.origin import ORIGIN_FILE, origin
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
 from enerf_ns.method.throughput import batch_factor
 from enerf_ns.poses.findings import findings
 from enerf_ns.quiet import silence_known_warnings
-from enerf_ns.terminal import clear_line, duration, say, say_where, without_chatter
+from enerf_ns.terminal import clear_line, columns, duration, say, say_plainly, say_table, say_where, without_chatter
 
 POSES_FILE = "poses.json"
 """Name of the file in a run's folder that states the errors found in clock, poses and lens."""
+
+CHOICES_FILE, CHOICES_COLUMNS = "choices.txt", 100
+"""Name of the file in a run's folder that states what was chosen and why, and the width of its lines."""
 
 LONG = 3600.0
 """Seconds of training from which the time that it takes is printed at the start."""
@@ -87,6 +93,15 @@ class EnerfTrainerConfig(TrainerConfig):
     _target: Type = field(default_factory=lambda: EnerfTrainer)  # noqa: UP006
     pipeline: EnerfPipelineConfig = field(default_factory=EnerfPipelineConfig)
     prompt: Fixed[Optional[str]] = None  # noqa: UP045
+    data: Optional[Path] = None  # noqa: UP045
+    """Folder of the recording."""
+    load_config: Optional[Path] = None  # noqa: UP045
+    """config.yml of a run to continue."""
+    max_num_iterations: int = 4000
+    """Number of steps."""
+    verbose: bool = False
+    """Print all choices for the recording, with their reasons and flags, as choices.txt in the run's folder states
+    them."""
     preset: Optional[str] = None  # noqa: UP045
     """Settings of the E-NeRF paper for one of its sequences: eds00, eds11, mocap-1d-trans, mocap-desk2,
     mocap-desk2-6views, shake-carpet1, shake-moon1, shake-moon2, spiral1, spiral1-sparse, spiral1-more-sparse or
@@ -98,10 +113,14 @@ class EnerfTrainerConfig(TrainerConfig):
     scored once at the end, in extra time. With 0 nothing is evaluated, not even at the end."""
 
     def __post_init__(self) -> None:
-        """Checks the config.yml of --load-config, since Nerfstudio would end with a traceback."""
+        """Checks the config.yml of --load-config, since Nerfstudio would end with a traceback. Hands --data on, since
+        Nerfstudio would print that it does."""
         if self.load_config is not None:
             with exit_with_a_sentence():
                 read_config(absolute(self.load_config))
+        elif self.data is not None and self.pipeline.datamanager.data != self.data:
+            self.pipeline = replace(self.pipeline, datamanager=replace(self.pipeline.datamanager, data=self.data))
+            self.data = None
 
     def resolved(self) -> EnerfTrainerConfig:
         """A copy in which everything is decided: absolute paths, the length of the decay of learning rates, and the
@@ -284,20 +303,32 @@ class EnerfTrainerConfig(TrainerConfig):
         """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Prints tables of the recording and of the choices for it, and stores config.yml and choices.json."""
+        """Prints the recording and the choices for it, and stores config, choices and origin of the run."""
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
-            CONSOLE.print(recording_table(resolution.applied_to(config.pipeline).datamanager.dataparser))
+            say_table(recording_table(resolution.applied_to(config.pipeline).datamanager.dataparser))
             for line in resolution.selection:
-                CONSOLE.print(Text(f"* {printable(line)}"))
-            CONSOLE.print(choices_table(resolution.choices))
+                say_plainly(f"* {line}")
+            say_plainly(" ".join(resolution.summary))
+            for flag in resolution.flags_to_state:
+                say_where("better with", flag)
+            if self.verbose:
+                CONSOLE.print(Text(choices_text(resolution.choices, columns())), soft_wrap=True)
+            if resolution.cause:
+                say(f"Training will hardly explain the events, because {resolution.cause}.")
             folder = config.get_base_dir()
-            choices = json.dumps([asdict(choice) for choice in resolution.choices], indent=2)
+            files = {
+                "config.yml": yaml.dump(config),
+                "choices.json": json.dumps([asdict(choice) for choice in resolution.choices], indent=2),
+                ORIGIN_FILE: json.dumps(origin(), indent=2),
+                CHOICES_FILE: choices_text(resolution.choices, CHOICES_COLUMNS),
+            }
             try:
-                write_together(folder, {"config.yml": yaml.dump(config).encode(), "choices.json": choices.encode()})
+                write_together(folder, {name: text.encode() for name, text in files.items()})
             except OSError as error:
                 raise _unwritable(folder, error) from error
+            say_where("all choices, their reasons and flags", quoted(folder / CHOICES_FILE))
             say_where("configuration", quoted(folder / "config.yml"))
 
     def setup(self, **kwargs: Any) -> EnerfTrainer:
@@ -342,7 +373,7 @@ class EnerfTrainer(Trainer):
     @exit_with_a_sentence()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         config = self.config
-        with without_chatter():
+        with without_chatter(), self.train_lock:  # a browser may be there before the checkpoint
             super().setup(test_mode)
         self.pipeline.num_steps = config.max_num_iterations
         self.error_against_time = ErrorAgainstTime(
@@ -432,7 +463,8 @@ class EnerfTrainer(Trainer):
         config.max_num_iterations = total - self._start_step  # Nerfstudio counts from the step of the checkpoint
         try:
             if is_main_process():
-                self.error_against_time.begin(self._start_step, self._recorded)
+                with self.train_lock:  # else a picture that is rendered meanwhile would be one of training
+                    self.error_against_time.begin(self._start_step, self._recorded)
             super().train()
         except OSError as error:  # from files that Nerfstudio writes beside checkpoints, such as TensorBoard's
             raise SystemExit(
@@ -550,10 +582,34 @@ class EnerfTrainer(Trainer):
         self._interrupted = self.stop_training = True
         say("Training is interrupted. It finishes this step and stores a checkpoint; a second signal stops it at once.")
 
+    def _update_viewer_state(self, step: int) -> None:
+        if isinstance(self.viewer_state, Viewer):
+            self.pipeline.viewer.after_step(step)
+        else:
+            super()._update_viewer_state(step)
+
     def _train_complete_viewer(self) -> None:
-        self._restore_signals()
-        with suppress(KeyboardInterrupt):  # which ends the viewer
-            super()._train_complete_viewer()
+        """Does nothing: Nerfstudio would wait here, before the last lines; `_end_viewer` waits after them."""
+
+    def _end_viewer(self, how: str) -> None:
+        """Says in the browser how training ended. After the last step, the viewer stays until Ctrl-C if the flag says
+        so, or if a browser shows it and the command runs on a terminal."""
+        viewer = self.viewer_state
+        if not isinstance(viewer, Viewer):
+            return
+        looked_at = bool(viewer.viser_server.get_clients())
+        at_terminal = looked_at and CONSOLE.is_terminal and sys.stdin.isatty()
+        stays = not self._interrupted and (at_terminal or not self.config.viewer.quit_on_train_completion)
+        config = quoted(self.base_dir / "config.yml")
+        show = "" if stays else f" `ns-viewer --load-config {config}` shows the run again."
+        self.pipeline.viewer.end(self._trained, f"**Training {how} at step {self._trained}.**{show}")
+        if stays:
+            say("The viewer stays until Ctrl-C.")
+            with suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(1.0)
+        elif looked_at:
+            time.sleep(0.5)  # in which viser sends the sentence
 
     def _after_train(self) -> None:
         self.step = self._trained  # Nerfstudio has counted one step more where training was stopped
@@ -565,12 +621,13 @@ class EnerfTrainer(Trainer):
             clear_line()
             self._say_skipped()
             say_where("continue", f"ns-train {self.config.method_name} --load-config {config}")
+            self._end_viewer("was interrupted")
             raise SystemExit(130)
         with without_chatter():
             super()._after_train()
         if self._unsaved:
             raise SystemExit(f"enerf: {self._unsaved}; the checkpoints before it stay. Make room, and continue.")
-        CONSOLE.rule("Training is done")
+        self._say_verdict()
         self._say_skipped()
         learned = self.pipeline.model.sensor.learned()
         if learned:
@@ -581,10 +638,21 @@ class EnerfTrainer(Trainer):
             "checkpoint": quoted(self.checkpoint_dir),
             "scores, picture and video": f"enerf report {config}",
             "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
-            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4",
+            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4 "
+            "--rendered-output-names display",
             "viewer": f"ns-viewer --load-config {config}",
         }.items():
             say_where(what, where)
+        self._end_viewer("has ended")
+
+    def _say_verdict(self) -> None:
+        """Prints the end of the training, and whether its field explains the events."""
+        found = self.error_against_time.verdict
+        say_table(Rule("Training is done" + (f": {found.short}" if found else "")))
+        if found is not None and found.explained == "yes":
+            say_plainly(found.sentence)
+        elif found is not None:
+            say(found.sentence)
 
     def _say_poses(self) -> None:
         """Prints the errors that were found in clock, poses and lens, and stores them with the run."""
@@ -592,7 +660,7 @@ class EnerfTrainer(Trainer):
         if refiner is None or not refiner.looks:
             return
         found = findings(refiner, manager.distance)
-        CONSOLE.print(findings_table(found))
+        say_table(findings_table(found))
         try:
             write_whole(self.base_dir / POSES_FILE, json.dumps([row.as_dict() for row in found], indent=2) + "\n")
         except OSError as error:

@@ -99,13 +99,15 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
                 look = style(number) | (FINAL if final else {"markersize": 4})
                 axis.plot([getattr(row, axis_of) for row in chosen], [row.scores[name] for row in chosen], **look)
         axis.set_ylabel(SCORES[name])
+        axis.margins(y=0.15)
         plain(axis)
     _logarithmic(axes[-1], "x", [getattr(row, axis_of) for row in drawn])
     axes[-1].set_xlabel("training time, s (log)" if axis_of == "seconds" else "training steps (log)")
     few = {row.num_frames for row in drawn if not row.final and row.num_frames}
-    over = f"{min(few)} held-out frames" if len(few) == 1 else "a few held-out frames"
-    marks = [("o", GREY, 4, "full", f"small, joined: {over}, during training")]
-    marks += [("o", GREY, 9, "full", "large: all held-out frames, at the end")]
+    over = f"{min(few)} held-out frames, " if len(few) == 1 else "a few held-out frames, " if few else ""
+    every = "all held-out frames, " if any(row.num_frames for row in drawn) else ""
+    marks = [("o", GREY, 4, "full", f"small, joined: {over}during training")]
+    marks += [("o", GREY, 9, "full", f"large: {every}at the end")]
     _legend(axes[0], runs, marks if any(row.final for row in drawn) else marks[:1])
     return figure
 
@@ -154,7 +156,7 @@ def work_precision(runs: Sequence[Curve]) -> Figure | None:
     axes[-1].set_xlabel("training time, s (log)")
     marks = [("o", GREY, 12, "none", "on the Pareto front: no other run is both faster and better")]
     if not all(run.over_all_frames for run in runs):
-        marks.append(("o", GREY, 6, "none", "hollow: a few held-out frames, during training"))
+        marks.append(("o", GREY, 6, "none", "hollow: during training"))
     _legend(axes[0], runs, marks)
     return figure
 

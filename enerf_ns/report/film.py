@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,17 +24,14 @@ from enerf_ns.dataparsers.index.event_index import OFF_COLOUR, ON_COLOUR, event_
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import OutputError
 from enerf_ns.dataparsers.recording.files import partial_of, write_whole
-from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Correction
+from enerf_ns.evaluation.display import Display
 from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.method.pipeline import EnerfPipeline
 
-MIDDLE_GREY = 0.5
-"""Displayed value of the median brightness, as far as a gamma of at most `SCREEN_GAMMA` can reach it."""
-SCREEN_GAMMA = 2.2
-"""Gamma of screens, which display brightness^(1 / 2.2) as linear brightness. Frames that a camera has already encoded
-need less."""
 VIDEO_SIDE, MOVING_SIDE = 480, 240
 """Least width of each picture in video.mp4, and width of each picture in moving.webp, pixels."""
+VIDEO_QUALITY, MOVING_QUALITY, PICTURE_QUALITY = 6, 40, 85
+"""Quality of video.mp4 from 0 to 10, and of moving.webp and other WebP pictures from 0 to 100."""
 MOVING_FRAMES, MOVING_MS, MOVING_PIXELS = 40, 90, 160 * 120
 """Pictures of moving.webp, milliseconds that each is shown, and most pixels of each that are rendered."""
 GAP = 8
@@ -42,13 +39,9 @@ GAP = 8
 
 
 @dataclass(frozen=True)
-class Screen:
+class Screen(Display):
     """Display of brightness and depth."""
 
-    correct: Callable[[Tensor], Tensor]
-    """From the field's linear brightness to the linear brightness of the frames."""
-    exponent: float
-    """Exponent of brightness for display."""
     near: float
     far: float
     """Depths in metres at the ends of the colours."""
@@ -56,16 +49,12 @@ class Screen:
     @classmethod
     def of(cls, views: Sequence[HeldOutView], depth_range: tuple[float, float]) -> Screen:
         """A display that suits views, whose brightness is not aligned, and a depth range in metres."""
-        correct = _correction(views)
-        shown = torch.cat([correct(view.rendered.double()).clamp(0, 1).flatten() for view in views])
-        median = float(shown[shown.isfinite()].median().clamp(1e-6, 0.999)) if shown.isfinite().any() else MIDDLE_GREY
-        exponent = min(max(math.log(MIDDLE_GREY) / math.log(median), 1 / SCREEN_GAMMA), 1.0)
-        return cls(correct, exponent, *depth_range)
+        shown = Display.of_views(views)
+        return cls(shown.correct, shown.exponent, *depth_range)
 
     def brightness(self, rendered: Float[Tensor, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """The field's linear brightness as displayed, 0 to 255."""
-        corrected = self.correct(rendered.cpu().double()).nan_to_num().clamp(0.0, 1.0)
-        return (255.0 * corrected**self.exponent).round().byte().numpy()
+        return (255.0 * self.shown(rendered.cpu())).round().byte().numpy()
 
     def depth(self, metres: Float[Tensor, "height width 1"]) -> UInt8[np.ndarray, "height width 3"]:
         """Depth in metres in the colours of viridis."""
@@ -73,28 +62,6 @@ class Screen:
 
         share = (metres[..., 0].cpu().nan_to_num(self.far).numpy() - self.near) / max(self.far - self.near, 1e-9)
         return np.rint(255.0 * colormaps["viridis"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
-
-    @property
-    def gamma(self) -> str:
-        """The display of brightness, in words."""
-        return f"brightness^(1/{1 / self.exponent:.1f})" if self.exponent < 1 else "brightness"
-
-
-def _correction(views: Sequence[HeldOutView]) -> Callable[[Tensor], Tensor]:
-    """The default protocol's fit of renders to frames. Without a fit, the 0.99 quantile of brightness becomes white."""
-    framed = [view for view in views if view.recorded is not None and view.rendered.isfinite().all()]
-    fit = PROTOCOLS[DEFAULT_PROTOCOL].fit
-    if framed and fit is not None:
-        columns = 3 if framed[0].colour_filter else 1
-        x = torch.cat([view.rendered.double().reshape(-1, columns) for view in framed])
-        y = torch.cat([view.recorded.double().reshape(-1, columns) for view in framed if view.recorded is not None])
-        fitted = fit(x, y)
-        if isinstance(fitted, Correction):
-            return fitted.apply
-    brightness = torch.cat([view.rendered.double().flatten() for view in views])
-    finite = brightness[brightness.isfinite()].numpy()
-    white = max(float(np.quantile(finite, 0.99)) if len(finite) else 1.0, 1e-9)
-    return lambda rendered: rendered / white
 
 
 def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], output: Path) -> None:
@@ -155,12 +122,33 @@ def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None
     for time in track(times.tolist(), "Rendering the moving picture", console=CONSOLE, transient=True):
         rays = posed.rays(pixels, torch.full_like(pixels, time)).reshape((len(rows), len(columns)))
         sides = [event_picture(index, camera, time), *_sides(pipeline, screen, rays)]
-        pictures.append(Image.fromarray(_below([_scaled(side, MOVING_SIDE) for side in sides], strip)))
+        pictures.append(_below([_scaled(side, MOVING_SIDE) for side in sides], strip))
+    write_whole(output, animated(pictures))
+
+
+def animated(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
+    """An animated WebP of pictures of one size, each shown for `MOVING_MS`, over and over."""
+    first, *others = map(Image.fromarray, pictures)
     content = io.BytesIO()
-    pictures[0].save(
-        content, "webp", save_all=True, append_images=pictures[1:], duration=MOVING_MS, loop=0, quality=55, method=4
-    )
-    write_whole(output, content.getvalue())
+    first.save(
+        content, "webp", save_all=True, append_images=others, duration=MOVING_MS, loop=0, quality=MOVING_QUALITY,
+        method=4,
+    )  # fmt: skip
+    return content.getvalue()
+
+
+def poster_of(video: Path) -> bytes:
+    """The picture in the middle of a video that `render_video` made, as a WebP file."""
+    opened = cv2.VideoCapture(str(video))
+    opened.set(cv2.CAP_PROP_POS_FRAMES, opened.get(cv2.CAP_PROP_FRAME_COUNT) // 2)
+    return webp(opened.read()[1][..., ::-1])
+
+
+def webp(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
+    """A picture as a WebP file."""
+    content = io.BytesIO()
+    Image.fromarray(picture).save(content, "webp", quality=PICTURE_QUALITY)
+    return content.getvalue()
 
 
 @torch.no_grad()
@@ -228,8 +216,9 @@ def _write_mp4(file: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
     unwritten = OutputError(f"{file.parent} could not take a video; make room on the disk.")
     first = next(pictures)
     video = write_frames(
-        str(file), first.shape[1::-1], fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="quiet"
-    )
+        str(file), first.shape[1::-1], fps=fps, codec="libx264", quality=VIDEO_QUALITY, macro_block_size=2,
+        ffmpeg_log_level="quiet",
+    )  # fmt: skip
     video.send(None)
     try:
         video.send(np.ascontiguousarray(first).tobytes())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.index.event_index import NO_EVENT, OFF_COLOUR, ON_COLOUR, event_picture
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from nerfstudio.cameras.cameras import Cameras
 
-PICTURE_ROWS = 3
-"""Number of held-out frames shown in the picture."""
 POLARITIES = {"brighter (on)": ON_COLOUR, "darker (off)": OFF_COLOUR, "no event": NO_EVENT}
 """Colours of an `event_picture` by meaning."""
+EVENTS = "events"
+"""Title of the column of events."""
 UNKNOWN = "#c9ced8"
 """Colour of unknown values, grey."""
 FAINTEST = 0.15
@@ -53,22 +54,34 @@ class Column:
     """Values at both ends of the colour scale."""
     opacities: Sequence[np.ndarray] | None = None
     """Opacity of each picture over grey, 0 to 1 (height, width). None: 1."""
+    is_main: bool = True
+    """Whether the column is shown first on the page."""
+
+    def coloured(self, number: int) -> UInt8[np.ndarray, "height width 3"] | None:
+        """The picture of a view in colours, 0 to 255; None if the view has none."""
+        from matplotlib import colormaps
+        from matplotlib.colors import to_rgb
+
+        picture = self.pictures[number]
+        if picture is None:
+            return None
+        colours = picture / 255.0 if picture.dtype == np.uint8 else picture
+        if self.bar:
+            low, high = self.limits
+            grey, opacity = np.array(to_rgb(UNKNOWN)), np.isfinite(picture).astype(float)
+            share = (np.where(np.isfinite(picture), picture, low) - low) / max(high - low, 1e-12)
+            if self.opacities is not None:
+                opacity = opacity * self.opacities[number]
+            colours = grey + opacity[..., None] * (colormaps[self.colours](share.clip(0, 1))[..., :3] - grey)
+        return np.rint(255.0 * colours.clip(0.0, 1.0)).astype(np.uint8)
 
 
-def shown_numbers(number: int) -> list[int]:
-    """Numbers of the held-out frames that are shown, evenly chosen."""
-    return np.unique(np.linspace(0, number - 1, PICTURE_ROWS).round().astype(int)).tolist()
-
-
-def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> Figure:
-    """Figure of held-out frames: frame, blurred frame, render, error, rendered, spread and true depth, and events.
-
-    Columns that the recording has no data for are left out.
+def side_by_side(columns: Sequence[Column], views: Sequence[HeldOutView]) -> Figure:
+    """Figure of the columns of views, with a row for each view.
 
     Args:
+        columns: The `columns_of` the views.
         views: Views to show, at least one.
-        recording: Recording of the events. Events are not shown for held-out frames with a clock of their own.
-        exponent: Exponent of brightness for display.
     """
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -76,7 +89,6 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, expone
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    columns = _columns(views, recording, exponent)
     height, width = views[0].depth.shape[:2]
     sides = [*[height / width] * len(views), 0.28]  # the last row explains the colours
     figure = Figure(figsize=(2.35 * len(columns), 0.3 + 2.35 * sum(sides)), layout="constrained", dpi=110)
@@ -102,19 +114,28 @@ def side_by_side(views: Sequence[HeldOutView], recording: EventRecording, expone
         if column.bar:
             bar = below[-1].inset_axes((0.04, 0.72, 0.92, 0.22))
             figure.colorbar(shown, cax=bar, orientation="horizontal", label=column.bar)
-        elif column.title == "events":
+        elif column.title == EVENTS:
             handles = [
                 Patch(facecolor="#{:02x}{:02x}{:02x}".format(*colour), edgecolor="grey", label=what)
                 for what, colour in POLARITIES.items()
             ]
             below[-1].legend(handles=handles, loc="upper center", frameon=False, fontsize=9, handlelength=1)
-    if recording.held_out_frames is None:
+    if any(column.title == EVENTS for column in columns):
         for axis, view in zip(axes[:-1, 0], views, strict=True):
             axis.set_ylabel(f"{view.time * 1e-9:.2f} s")
     return figure
 
 
-def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: float) -> list[Column]:
+def columns_of(views: Sequence[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> list[Column]:
+    """Columns of views: frame, blurred frame, render, error, rendered, spread and true depth, and events.
+
+    Columns that the recording has no data for are left out.
+
+    Args:
+        views: Views to show, at least one.
+        recording: Recording of the events. Events are not shown for held-out frames with a clock of their own.
+        exponent: Exponent of brightness for display.
+    """
     rendered = [view.rendered.nan_to_num().clamp(0, 1).numpy() for view in views]
     recorded = [None if view.recorded is None else view.recorded.clamp(0, 1).numpy() for view in views]
 
@@ -126,7 +147,7 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: 
         columns.append(Column("held-out frame", shown(recorded)))
     blurred = [_blurred_frame(recording, view.time) for view in views]
     if any(picture is not None for picture in blurred):
-        columns.append(Column("blurred frame", shown(blurred)))
+        columns.append(Column("blurred frame", shown(blurred), is_main=False))
     columns.append(Column("render", shown(rendered)))
     if any(picture is not None for picture in recorded):
         errors = [
@@ -146,12 +167,12 @@ def _columns(views: Sequence[HeldOutView], recording: EventRecording, exponent: 
         Column("rendered depth", depths, "metres (pale: uncertain)" if sure else "metres", "viridis", limits, faded)
     )
     if spread:
-        columns.append(Column("spread depth", spread, "metres", "viridis", limits))
+        columns.append(Column("spread depth", spread, "metres", "viridis", limits, is_main=False))
     if any(depth is not None for depth in true):
-        columns.append(Column("true depth", true, "metres (grey: unknown)", "viridis", limits))
+        columns.append(Column("true depth", true, "metres (grey: unknown)", "viridis", limits, is_main=False))
     if recording.held_out_frames is None:
         index = index_events(recording)
-        columns.append(Column("events", [event_picture(index, recording.camera, view.time) for view in views]))
+        columns.append(Column(EVENTS, [event_picture(index, recording.camera, view.time) for view in views]))
     return columns
 
 

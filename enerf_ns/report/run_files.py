@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
 from enerf_ns.method.checkpoints import newest_checkpoint, read_config
+from enerf_ns.method.origin import ORIGIN_FILE
 
 if TYPE_CHECKING:
     from enerf_ns.dataparsers.recording.recording import EventRecording
@@ -18,6 +21,9 @@ if TYPE_CHECKING:
 
 RECENT_SECONDS = 600.0
 """Age in seconds of the newest file of training up to which an unfinished run counts as still going."""
+
+CHOICES_FILE = "choices.json"
+"""Name of the file with the table of choices."""
 
 WRITTEN_BY_TRAINING = ("config.yml", HISTORY_FILE, "events.out.*", "previews/*", "nerfstudio_models/*")
 """Patterns of the files that training writes into the folder of a run."""
@@ -39,6 +45,10 @@ class RunFiles:
     """In words: done, still going, stopped or crashed, with the number of steps."""
     notes: tuple[str, ...] = ()
     """Problems of the files, one sentence each."""
+    choices: Sequence[dict[str, Any]] = ()
+    """Rows of the table of choices, with part, kept, value, why and flag; empty if they are not stored."""
+    origin: Mapping[str, str] = field(default_factory=dict)
+    """Command, version, date and machine of the training; empty if they are not stored."""
 
     @property
     def folder(self) -> Path:
@@ -93,11 +103,21 @@ def read_run(path: Path) -> RunFiles:
         checkpoint = newest_checkpoint(folder / "nerfstudio_models")
     except RecordingError as error:
         notes.append(str(error))
+    about: dict[str, Any] = {CHOICES_FILE: [], ORIGIN_FILE: {}}
+    for name in about:
+        try:
+            if (folder / name).exists():
+                with reading(folder / name, "JSON"):
+                    about[name] = json.loads((folder / name).read_text())
+        except RecordingError as error:
+            notes.append(str(error))
     stored = int(checkpoint.stem.removeprefix("step-")) + 1 if checkpoint else 0
     written = [file.stat().st_mtime for pattern in WRITTEN_BY_TRAINING for file in folder.glob(pattern)]
     state = _state(config, history, stored, time.time() - max(written))
     steps = max([stored, *(row.step for row in history)])
-    return RunFiles(config_file, config, history, steps, stored, state, tuple(notes))
+    return RunFiles(
+        config_file, config, history, steps, stored, state, tuple(notes), about[CHOICES_FILE], about[ORIGIN_FILE]
+    )
 
 
 def _state(config: EnerfTrainerConfig, history: list[HistoryRow], stored: int, age: float) -> str:

@@ -18,6 +18,30 @@ from enerf_ns.report.trade_offs import seconds_to_reach
 NONE = "-"
 """Cell without a value."""
 
+MEANINGS = {
+    "psnr": "Peak signal-to-noise ratio of renders against held-out frames; higher is better. At 20 dB the root mean "
+    "square error is 10 % of white, and at 30 dB 3 %.",
+    "ssim": "Structural similarity of renders and held-out frames; 1 is best.",
+    "lpips": "Perceptual distance between renders and held-out frames, by AlexNet; 0 is best.",
+    "lpips_vgg": "Perceptual distance between renders and held-out frames, by VGG-16; 0 is best.",
+    "correlation": "Correlation of render and frame before the brightness of the render is corrected; 1 is best.",
+    "depth_rmse": "Root mean square error of rendered depth, over all pixels whose true depth is known; 0 is best. "
+    "Plain surfaces cause no events, so their depth is a guess.",
+    "depth_rmse_known": "The same error over the pixels where the field is confident of its depth.",
+    "depth_known": "Share of the pixels where the field is confident of its depth.",
+    "depth_rmse_spread": "The same error after known depth was spread over plain surfaces.",
+    "event_correlation": "Correlation between changes of log brightness that are rendered and those that held-out "
+    "events measured. At 1 the render explains all changes, and at 0 none. The square is the share of their variance "
+    "that is explained. It ignores a wrong scale of brightness. Noise of the sensor keeps it below 1.",
+    "event_rmse": "Root mean square difference between rendered and measured changes, in contrast thresholds; 0 is "
+    "best, and 1 is the change of one event.",
+    "event_sign": "Share of the changes whose rendered sign is the measured one; 1 is best, and 0.5 is chance.",
+}
+"""Meaning of each score for readers."""
+
+HOW_TO_READ = {SCORES[name]: meaning for name, meaning in MEANINGS.items()}
+"""Meaning of each score by its label."""
+
 
 @dataclass(frozen=True)
 class Table:

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.dataparsers.recording.errors import FlagError, printable
+from enerf_ns.dataparsers.recording.errors import FlagError, printable, quoted
 
 if TYPE_CHECKING:
     from enerf_ns.report.tables import Table
@@ -50,6 +50,7 @@ class Bench:
         where = bench.output_dir / self.experiment
         drawn = ", error against time in .png" if where.with_suffix(".png").exists() else ""
         print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
+        print(f"compare later results with it: enerf bench {self.experiment} --against {quoted(where)}.json")
         if bench.before is not None:
             changes = changes_since(table, bench.before)
             CONSOLE.print(changes_table(changes, str(self.settings.against)).rich())

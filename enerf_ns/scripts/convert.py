@@ -12,6 +12,7 @@ from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
+from enerf_ns.scripts.next_steps import print_next
 
 
 @dataclass
@@ -59,6 +60,8 @@ class Convert:
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
+        if source.is_dir() or (self.poses is not None and self.camera is not None):
+            print_next(output_dir)
 
     def _convert_refined(self, run: Path, source: Path, output_dir: Path) -> list[str]:
         """Writes the recording with the poses that a run refined, and returns sentences about it."""

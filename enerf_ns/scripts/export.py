@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
-from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, printable
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, printable, quoted
 from enerf_ns.dataparsers.recording.files import absolute, expanded, write_together
 
 if TYPE_CHECKING:
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".ply", ".glb")
 POSE_SUFFIXES = (".txt",)
-
-VOXEL_PIXELS = 1.5
-"""Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
 
 
 @dataclass
@@ -50,7 +47,7 @@ class Export:
 
     def main(self) -> None:
         from enerf_ns.export.scoring import simulated_scene, surface_scores
-        from enerf_ns.export.surface import fused, pixel_size, points_of, surface_views
+        from enerf_ns.export.surface import VOXEL_PIXELS, fused, pixel_size, points_of, surface_views
         from enerf_ns.method.runs import load
         from enerf_ns.report.run_files import read_run
         from enerf_ns.simulator.scene.scene_files import load_scene
@@ -71,7 +68,7 @@ class Export:
             for flag, value in (("--voxel", self.voxel), ("--reference", self.reference)):
                 if value is not None:
                     raise FlagError(f"{flag} is for meshes and points; leave it out.")
-            self._write_poses(load(files.config_file).pipeline, output)
+            self._write_poses(load(files.config_file).pipeline, files.config_file, output)
             return
         notes: list[str] = []
         scene = load_scene(expanded(self.reference), np.random.default_rng(0), notes) if self.reference else None
@@ -102,7 +99,7 @@ class Export:
         for line in [*(f"note: {note}" for note in notes), *lines]:
             print(printable(line))
 
-    def _write_poses(self, pipeline: EnerfPipeline, output: Path) -> None:
+    def _write_poses(self, pipeline: EnerfPipeline, config_file: Path, output: Path) -> None:
         from enerf_ns.dataparsers.formats.writer import camera_json, encode_tum
         from enerf_ns.poses.findings import findings
 
@@ -115,6 +112,10 @@ class Export:
         for line in corrected or ["No error of the poses was found. They are those of the recording."]:
             print(printable(line))
         print(printable(f"{len(recording.trajectory.times):,} poses: {output}"))
+        print(
+            f"a recording with them: enerf convert {quoted(recording.path)} --run {quoted(config_file)} "
+            f"--output-dir {quoted(recording.path.with_name(f'{recording.path.name}-refined'))}"
+        )
 
 
 def _write(output: Path, files: dict[str, bytes]) -> None:

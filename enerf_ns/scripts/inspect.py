@@ -11,7 +11,7 @@ from rich.console import Console
 
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.inspection.page import Inspection
-from enerf_ns.dataparsers.recording.errors import OutputError, printable
+from enerf_ns.dataparsers.recording.errors import OutputError, printable, quoted
 from enerf_ns.dataparsers.recording.files import absolute, write_whole
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
 
@@ -62,3 +62,5 @@ class Inspect:
             reason = f"could not be written ({error.strerror})"
             raise OutputError(f"--output {output} {reason}; give another file.") from error
         print(printable(f"Pictures are in {output}"))
+        if not chosen and self.run is None:
+            print(f"train: ns-train enerf --data {quoted(data)}")

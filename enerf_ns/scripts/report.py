@@ -28,7 +28,7 @@ class Report:
     """Values of PSNR in dB. The report says after how much training each run reaches them. Default: up to four values
     that a run reaches."""
     video: bool = True
-    """Render video.mp4, a flight past the held-out cameras, and moving.webp, the recorded path."""
+    """Render video.mp4, a flight past the held-out cameras; moving.webp, the recorded path; and mesh.webp, the mesh."""
     scoring: Annotated[Scoring, tyro.conf.arg(name="")] = field(default_factory=Scoring)
     """Scoring of held-out frames. With other values than the defaults, all held-out frames are rendered again."""
 

@@ -11,7 +11,8 @@ from typing import Annotated, Optional  # tyro reads these annotations on Python
 
 import tyro
 
-from enerf_ns.dataparsers.recording.errors import FlagError, printable, quoted
+from enerf_ns.dataparsers.recording.errors import FlagError, printable
+from enerf_ns.scripts.next_steps import print_next
 from enerf_ns.sensor.response import Logarithm
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
@@ -42,12 +43,11 @@ class Simulate:
         made = simulate(settings, self.output_dir, self.preview)
         for note in made.notes:
             print(printable(f"note: {note}"))
-        lines = [
-            f"{made.num_events:,} events and {made.num_frames} frames of {made.duration * 1e-9:g} s are in "
-            f"{made.folder}"
-        ]
-        if made.has_poses and made.num_events:
-            folder = quoted(made.folder)
-            lines += [f"check it: enerf inspect {folder}", f"train: ns-train enerf --data {folder}"]
-        for line in lines:
-            print(printable(line))
+        seconds = made.duration * 1e-9
+        print(
+            printable(f"{made.num_events:,} events and {made.num_frames} frames of {seconds:g} s are in {made.folder}")
+        )
+        if not made.has_poses:
+            print("Before training, add poses.txt, as docs/formats.md shows (“Write a recording yourself”).")
+        elif made.num_events:
+            print_next(made.folder)

@@ -141,7 +141,7 @@ class PixelResponse(SensorPart):
 
 def seen_range(scene: SensorChoices) -> tuple[float, str]:
     """The range of log brightness that a pixel sees according to its events, and the reason for it."""
-    thresholds, _ = scene.once(chosen_thresholds)
+    thresholds = scene.once(chosen_thresholds).values
     if scene.learns_sensor and scene.once(chosen_refractory_period)[0]:
         # blind pixels seldom miss as many changes of either polarity
         on, off = balanced_thresholds(scene.index)

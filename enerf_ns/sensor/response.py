@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from enerf_ns.dataparsers.recording.picture_depth import LUMA
 from enerf_ns.kernels.precision import full_precision
 
 LINEAR_UNTIL = 20.0
@@ -167,10 +168,6 @@ def inverse_linlog(log_brightness: Float[Array, "*batch"]) -> Float[Array, "*bat
 def _library(values: Tensor | np.ndarray) -> Any:
     """The module whose functions take these values."""
     return torch if isinstance(values, Tensor) else np
-
-
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in the brightness that a grey sensor sees (ITU-R BT.601)."""
 
 
 @full_precision

@@ -156,7 +156,7 @@ class PixelThresholds(Thresholds):
     def choose(cls, scene: SensorChoices) -> None:
         """Decides whether the map is learned."""
         name, index = "model.sensor.learn_threshold_map", scene.once(unknown_events)
-        spread = None if index is None else threshold_spread(index, scene.once(chosen_thresholds)[0])
+        spread = None if index is None else threshold_spread(index, scene.once(chosen_thresholds).values)
         kept = scene.use(name, lambda: spread is not None)
         why = spread.why if spread else "events do not show that the thresholds of pixels differ"
         value = "thresholds of each pixel are learned" if kept else ""

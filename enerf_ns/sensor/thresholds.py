@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
+from typing import ClassVar, NamedTuple, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
 import torch
 from torch import Tensor, nn
@@ -57,7 +57,7 @@ class Thresholds(SensorPart):
     @classmethod
     def choose(cls, scene: SensorChoices) -> None:
         """Decides the thresholds, and whether their ratio and their mean are learned."""
-        (on, off), estimate = scene.once(chosen_thresholds)
+        (on, off), estimate, _ = scene.once(chosen_thresholds)
         index, enough = scene.once(unknown_events), scene.once(enough_for_thresholds)
         blind, _ = scene.once(chosen_refractory_period)
         # where pixels are never blind, counts determine it better: on slider_depth what was learned drifted by a fifth
@@ -124,23 +124,35 @@ def ratio_error(index: EventIndex) -> float:
     return 2.0 / math.sqrt(len(index))
 
 
-def chosen_thresholds(scene: SensorChoices) -> tuple[tuple[float, float], Estimate | None]:
-    """The thresholds of a scene, and the estimate of C_on if they are estimated."""
-    estimate = None
+class ChosenThresholds(NamedTuple):
+    """The thresholds of a scene."""
+
+    values: tuple[float, float]
+    """C_on and C_off."""
+    estimate: Estimate | None
+    """The estimate of C_on if they are estimated."""
+    is_assumed: bool
+    """Whether their mean is assumed, since neither the recording nor a flag nor frames state it."""
+
+
+def chosen_thresholds(scene: SensorChoices) -> ChosenThresholds:
+    """The thresholds of a scene, and where they are from."""
+    estimate, is_measured = None, True
 
     def from_recording() -> tuple[float, float]:
-        nonlocal estimate
+        nonlocal estimate, is_measured
         if scene.recording.contrast_thresholds is not None:
             return scene.recording.contrast_thresholds
-        estimate, off, _ = contrast_thresholds(scene.recording, scene.once(chosen_refractory_period)[0])
+        blind, _ = scene.once(chosen_refractory_period)
+        estimate, off, is_measured = contrast_thresholds(scene.recording, blind)
         return estimate.value, off.value
 
-    return scene.use(SETTING, from_recording), estimate
+    return ChosenThresholds(scene.use(SETTING, from_recording), estimate, not is_measured)
 
 
 def unknown_events(scene: SensorChoices) -> EventIndex | None:
     """The events of a sensor whose thresholds nobody states, which is then measured and learned; None for others."""
-    estimate = scene.once(chosen_thresholds)[1]
+    estimate = scene.once(chosen_thresholds).estimate
     return scene.index if scene.learns_sensor and estimate is not None else None
 
 

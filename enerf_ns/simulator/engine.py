@@ -108,7 +108,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
         num_events=writer.num_events,
         num_frames=writer.num_frames,
         has_poses=view.trajectory is not None,
-        notes=(*notes, *writer.notes),
+        notes=tuple(notes),
     )
 
 

@@ -6,11 +6,11 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ import torch
 from small_runs import SMALL_BENCH
 from warm_commands import WarmCommands
 
-from enerf_ns.bench import runner
+from enerf_ns.bench import measures, runner
 from enerf_ns.bench.experiments import ROWS, SEQUENCES, Row, Sequence
 from enerf_ns.bench.measures import MEASURES, TRUTH, evaluate, milliseconds_a_step
 from enerf_ns.bench.runner import Bench, parse_budget, steps_of
@@ -265,6 +265,29 @@ def test_measures_of_a_run(finished: Path):
     assert sum(parts) == pytest.approx(100.0) and found["images"] == 0.0 and min(parts[:3]) > 0.0
 
 
+def test_a_part_of_a_step_takes_the_median_of_its_calls_in_milliseconds(monkeypatch: pytest.MonkeyPatch):
+    """With a clock that each call moves on; the first call, which warms up, does not count."""
+    seconds = [7.0, *4 * [0.001], 0.0025, *4 * [0.9]]
+    now = 0.0
+
+    def call() -> None:
+        nonlocal now
+        now += seconds.pop(0)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    run: Any = SimpleNamespace(pipeline=SimpleNamespace(device="cpu"))
+    assert measures._milliseconds(call, run) == pytest.approx(2.5) and not seconds
+
+
+def test_megabytes_of_a_step_are_what_is_kept_and_four_numbers_of_each_parameter(monkeypatch: pytest.MonkeyPatch):
+    """The parameter, its gradient and two moments of Adam, of four bytes each."""
+    monkeypatch.setattr(measures, "kept_bytes", lambda *_: 3_000_000)
+    pipeline = torch.nn.Module()
+    pipeline.model = torch.nn.Linear(999, 250)
+    run: Any = SimpleNamespace(pipeline=pipeline)
+    assert MEASURES["memory"](run, [])["megabytes_a_step"] == pytest.approx(3.0 + 16 * 250_000 / 1e6)
+
+
 @pytest.fixture(scope="session")
 def finished_sensor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of a small bench of the experiment sensor, of one sequence with faults."""
@@ -418,12 +441,3 @@ def test_the_command_names_no_place_of_this_machine(tmp_path: Path):
     assert Bench("slider-depth", settings).results([])["command"] == (
         "enerf bench slider-depth --data path/to/slider --budget 120s --scale 0.25 --seeds 2 --rows events"
     )
-
-
-def test_the_version_names_the_commit():
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
-    if head.returncode:
-        assert runner.code_version() == runner.enerf_ns.__version__
-    else:
-        version, _, commit = runner.code_version().partition("+")
-        assert version == runner.enerf_ns.__version__ and head.stdout.startswith(commit.removesuffix("-dirty"))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 KINDS = ("frames", "blurred_frames")
@@ -69,3 +71,43 @@ def longer_focal_length(recording: EventRecording, factor: float) -> EventRecord
     return replace(
         recording, camera=camera, **{kind: value and replace(value, camera=camera) for kind, value in frames.items()}
     )
+
+
+def turned_events(
+    recording: EventRecording, of: Callable[[Events, Camera], tuple[np.ndarray, np.ndarray]]
+) -> EventRecording:
+    """The file holds other x and y; both are a function of the events and the camera."""
+
+    def events() -> Iterator[Events]:
+        for read in recording.stream_events():
+            x, y = of(read, recording.camera)
+            yield Events(x, y, read.t, read.p)
+
+    return replace(recording, stream_events=events)
+
+
+def exchanged(recording: EventRecording, camera: str) -> EventRecording:
+    """The file holds x for y and y for x.
+
+    Args:
+        recording: Whose frames stay as they are.
+        camera: What is exchanged in the calibration too: "size" or "all" of it.
+    """
+    wrong, stated = turned_events(recording, lambda events, _: (events.y, events.x)), recording.camera
+    changed = replace(stated, width=stated.height, height=stated.width)
+    if camera == "all":
+        k1, k2, p1, p2 = stated.distortion
+        changed = replace(changed, fx=stated.fy, fy=stated.fx, cx=stated.cy, cy=stated.cx, distortion=(k1, k2, p2, p1))
+    return replace(wrong, camera=changed)
+
+
+def cropped(recording: EventRecording, columns: slice, rows: slice) -> EventRecording:
+    """The file holds only the events of a part of the sensor, counted from its first column and row."""
+
+    def events() -> Iterator[Events]:
+        for read in recording.stream_events():
+            x, y = read.x.astype(int), read.y.astype(int)
+            kept = (columns.start <= x) & (x < columns.stop) & (rows.start <= y) & (y < rows.stop)
+            yield Events(x[kept] - columns.start, y[kept] - rows.start, read.t[kept], read.p[kept])
+
+    return replace(recording, stream_events=events)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,26 @@ BLOCK = 4
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 50.0, 23.5, 17.5)
 
 
-def log_brightness(time: float) -> np.ndarray:
-    """Log brightness of each pixel at a time (s), between that of 30 and of 220 grey levels; float64 [pixels]."""
+@cache
+def waves() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angular frequency, size and phase of the three waves of each pixel; float64 [waves, pixels]."""
     generator = np.random.default_rng(0)
     blocks = WIDTH // BLOCK * (HEIGHT // BLOCK)
     frequency, phase = generator.uniform(0.5, 4.0, (3, blocks)), generator.uniform(0, 2 * np.pi, (3, blocks))
     size = generator.dirichlet(np.ones(3), blocks).T
     y, x = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
     block = y // BLOCK * (WIDTH // BLOCK) + x // BLOCK
-    frequency, size, phase = frequency[:, block], size[:, block], phase[:, block] + 0.1 * (x + y)
+    return 2 * np.pi * frequency[:, block], size[:, block], phase[:, block] + 0.1 * (x + y)
+
+
+def log_brightness(time: float) -> np.ndarray:
+    """Log brightness of each pixel at a time (s), between that of 30 and of 220 grey levels; float64 [pixels]."""
+    frequency, size, phase = waves()
     low, high = np.log(30 / 255), np.log(220 / 255)
-    return (low + high) / 2 + (high - low) / 2 * (size * np.sin(2 * np.pi * frequency * time + phase)).sum(0)
+    return (low + high) / 2 + (high - low) / 2 * (size * np.sin(frequency * time + phase)).sum(0)
 
 
+@cache
 def events_of_waves(
     thresholds: tuple[float, float], duration: float, blind_for: int = 0, spread: float = 0.0
 ) -> Events:

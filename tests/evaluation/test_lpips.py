@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,8 @@ import torchvision
 from torch.nn.functional import conv2d, max_pool2d, relu
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-from enerf_ns.evaluation.lpips import NETWORKS, Net, load_lpips, lpips
+from enerf_ns.evaluation.lpips import NETWORKS, Net, load_lpips, lpips, torchvision_file
+from enerf_ns.scripts import cli
 
 WEIGHTS_VARIABLE, SMALLEST_SIDE = NETWORKS["alex"].weights_variable, NETWORKS["alex"].smallest_side
 
@@ -140,24 +143,71 @@ def test_one_network_without_weights_leaves_the_other_as_it_is(
     random_vgg: torch.nn.Module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nothing"))
-    assert lpips(IMAGE, IMAGE) == "its weights could not be loaded" and lpips(IMAGE, IMAGE, "vgg") == 0.0
+    assert str(lpips(IMAGE, IMAGE)).endswith("nothing, is missing") and lpips(IMAGE, IMAGE, "vgg") == 0.0
 
 
 @pytest.mark.parametrize("net", NETWORKS)
 @pytest.mark.parametrize("content", [None, b"", b"no weights"])
-def test_without_weights_there_is_no_distance_and_one_line_says_why(
+def test_without_weights_the_reason_is_told_and_nothing_is_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, content: bytes | None, net: Net
 ):
-    path = tmp_path / "weights.pth"
+    path, found = tmp_path / "weights.pth", "is missing" if content is None else "does not hold its weights"
     if content is not None:
         path.write_bytes(content)
-    monkeypatch.setenv(NETWORKS[net].weights_variable, str(path))
-    assert [lpips(IMAGE, IMAGE, net), lpips(IMAGE, IMAGE, net)] == ["its weights could not be loaded"] * 2
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 1 and NETWORKS[net].weights_variable in lines[0]
+    variable = NETWORKS[net].weights_variable
+    monkeypatch.setenv(variable, str(path))
+    assert lpips(IMAGE, IMAGE, net) == f"the file of {variable}, {path}, {found}"
+    assert "".join(capsys.readouterr()) == ""
+
+
+@pytest.fixture
+def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Random weights of AlexNet at the address from which torchvision downloads them: that of a file. Nothing is in
+    torchvision's folder of downloads yet."""
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    torch.save(torchvision.models.alexnet(weights=None).state_dict(), tmp_path / "weights")
+    digest = hashlib.sha256((tmp_path / "weights").read_bytes()).hexdigest()[:8]
+    file = (tmp_path / "weights").rename(tmp_path / f"alexnet-{digest}.pth")
+    monkeypatch.setattr(torchvision.models.AlexNet_Weights.DEFAULT.value, "url", file.as_uri())
+    before = torch.hub.get_dir()
+    torch.hub.set_dir(tmp_path / "hub")
+    yield file
+    torch.hub.set_dir(before)
+
+
+def fetch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["enerf", "fetch-lpips"])
+    cli.entrypoint()
+
+
+def test_weights_are_fetched_by_a_command_alone(
+    published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    assert lpips(IMAGE, IMAGE) == "its weights are not here; get them by enerf fetch-lpips alex"
+    stored = torchvision_file(NETWORKS["alex"])
+    for broken in (None, b"", published.read_bytes()[:1000]):
+        if broken is not None:
+            stored.write_bytes(broken)
+            load_lpips.cache_clear()
+            assert lpips(IMAGE, IMAGE) == "its weights cannot be read; get them by enerf fetch-lpips alex"
+        fetch(monkeypatch)
+        assert capsys.readouterr().out.splitlines()[-1] == f"The weights of LPIPS with alex are in {stored}"
+        assert stored.read_bytes() == published.read_bytes()
+    published.unlink()
+    fetch(monkeypatch)  # nothing is downloaded any more
+    load_lpips.cache_clear()
+    own = LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)  # with the same, by its own way
+    pictures = [image.movedim(-1, 0)[None] for image in (noisy(IMAGE, 0.2), IMAGE)]
+    assert lpips(noisy(IMAGE, 0.2), IMAGE) == pytest.approx(float(own(*pictures)), rel=1e-6)
+
+
+def test_weights_that_cannot_be_fetched_are_one_sentence(published: Path, monkeypatch: pytest.MonkeyPatch):
+    published.unlink()
+    with pytest.raises(SystemExit, match=r"could not be downloaded to .*; download it where there is a network, and"):
+        fetch(monkeypatch)
 
 
 def test_weights_that_do_not_fit_are_no_distance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     torch.save({"0.weight": torch.zeros(3)}, tmp_path / "weights.pth")
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights.pth"))
-    assert lpips(IMAGE, IMAGE) == "its weights could not be loaded"
+    assert str(lpips(IMAGE, IMAGE)).endswith("weights.pth, does not hold its weights")

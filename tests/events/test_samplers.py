@@ -23,6 +23,7 @@ from enerf_ns.events.samplers import (
     InstantPairSampler,
     SilentIntervalSampler,
     SilentPixelSampler,
+    rates_around,
 )
 from enerf_ns.sensor.part import GREY
 from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
@@ -315,6 +316,28 @@ def test_successors_measure_the_threshold_and_other_pairs_miss_what_changes_whil
     np.testing.assert_allclose(error, unseen, atol=1e-7)
     error, _ = errors(EventPairSampler(index, "successor"), 0)
     assert (max(map(abs, error)) > 0.01) == (refractory > 0)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("refractory", [0, 1_000_000, 8_000_000])
+def test_rates_are_exact_where_log_brightness_has_a_constant_second_derivative(refractory: int, sign: int):
+    """At each event, and when its pixel sees again. The first and the last have the rate of their one interval."""
+
+    def slope(time: float) -> float:
+        return 8.0 + 20.0 * time * 1e-9
+
+    fired = fire(lambda t: sign * (8e-9 * t + 10.0 * (1e-9 * t) ** 2), 1e9, *THRESHOLDS, refractory)
+    index, number, threshold = index_of({0: fired}), len(fired), THRESHOLDS[sign < 0]
+    assert number > 20 and {polarity for _, polarity in fired} == {sign}
+    events = torch.arange(number)
+    for delay in (0, refractory):
+        found = rates_around(index, events, torch.zeros_like(events), delay, refractory)
+        own, other = (found[:, 0], found[:, 1]) if sign > 0 else (found[:, 1], found[:, 0])
+        expected = [slope(time + delay) / threshold for time, _ in fired]
+        expected[0] = 1e9 / (fired[1][0] - fired[0][0] - refractory)
+        expected[-1] = 1e9 / (fired[-1][0] - fired[-2][0] - refractory)
+        np.testing.assert_allclose(own, expected, rtol=1e-5)
+        assert not other.any()
 
 
 def test_the_same_seed_draws_the_same_pairs() -> None:

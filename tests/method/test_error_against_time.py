@@ -21,6 +21,7 @@ from nerfstudio.utils import writer
 from PIL import Image
 from small_runs import EVENTS, set_up, small_config
 
+from enerf_ns import terminal
 from enerf_ns.dataparsers.recording.files import load_image
 from enerf_ns.evaluation import scores as evaluation_scores
 from enerf_ns.evaluation.history import HISTORY_FILE, read_history
@@ -136,6 +137,25 @@ def test_the_time_of_a_run_is_that_of_its_steps_alone(recording: Path, tmp_path:
     assert clock.now == 80 + spent + 3 * 0.5, "all three held-out frames are scored at the end"
     steps = np.array([row.step for row in rows[:-1]])
     assert (steps[1:] >= np.floor(SMALLEST_GROWTH * steps[:-1])).all() and steps[0] <= 10
+
+
+def test_the_time_left_does_not_count_the_first_step_which_compiles(
+    recording: Path, tmp_path: Path, clock: Clock, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(terminal, "PRINTED_EVERY", 0.0)
+    watch = set_up(config_of(recording, tmp_path, 62, share=0.0)).error_against_time
+    watch.pipeline.last_step = SimpleNamespace(losses={"event_loss": torch.tensor(0.5)})
+    watch.begin(0, None)
+    capsys.readouterr()
+    for number, seconds in enumerate((600.0, 2.0)):
+        with watch.step(number):
+            clock.now += seconds
+        watch.after_step(number, {})
+    assert capsys.readouterr().out.splitlines() == [
+        "step 1 of 62, loss 0.5",
+        "step 2 of 62, 2 min 0 s left, loss 0.5",
+    ]
+    assert watch.seconds == 602.0, "the run did take that time"
 
 
 def test_a_row_holds_scores_losses_and_the_parts_of_a_step(

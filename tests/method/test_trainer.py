@@ -15,7 +15,7 @@ import yaml
 from nerfstudio.utils.rich_utils import CONSOLE
 from small_runs import set_up, small_config
 
-from enerf_ns.choices.table import choices_table, recording_table
+from enerf_ns.choices.table import choices_text, recording_table
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.method import trainer as trainer_module
 from enerf_ns.method.config import enerf
@@ -43,6 +43,11 @@ def test_config_and_choices_that_are_stored(recording: Path, tmp_path: Path, mon
     choices = {choice["part"]: choice for choice in json.loads((run / "choices.json").read_text())}
     assert choices["event loss"]["kept"] and not choices["silent pixels"]["kept"] and not choices["frame loss"]["kept"]
     assert all(choice["why"] and choice["flag"] for choice in choices.values())
+    lines = (run / "choices.txt").read_text().splitlines()
+    assert all(len(line) <= 100 for line in lines), "none has a path here, which alone may be longer"
+    for choice in choices.values():
+        assert f"    {choice['flag']}" in lines, "a flag stands alone on its line, so that it can be copied"
+        assert any(line.startswith(f"{choice['part']}, {'kept' if choice['kept'] else 'left out'}") for line in lines)
 
 
 def test_all_ranks_train_with_what_config_yml_states_though_each_would_measure_something_else(
@@ -85,19 +90,21 @@ def test_the_learning_rate_falls_to_a_tenth_at_the_last_step_however_long_the_ru
     np.testing.assert_allclose(ratio, 0.1 ** (1 / 7), rtol=1e-6)
 
 
-def test_resuming_from_what_was_stored_prints_the_same_table(recording: Path, tmp_path: Path, capsys):
+def test_resuming_from_what_was_stored_prints_the_same_choices(recording: Path, tmp_path: Path, capsys):
     """What was chosen does not come to count as set by flag."""
     config = small_config(recording, tmp_path)
+    config.verbose = True
     config.save_config()
     first = capsys.readouterr().out
     stored = tmp_path / "recording/enerf/run/config.yml"
     again = yaml.load(stored.read_text(), Loader=yaml.Loader)
     again.save_config()
-    table, again_table = (
-        text[text.index("Parts of the method") : text.index("forced by")] for text in (first, capsys.readouterr().out)
+    choices, again_choices = (
+        text[text.index("The field learns from") : text.index("all choices")]
+        for text in (first, capsys.readouterr().out)
     )
-    assert again_table == table
-    assert "the recording" in table and "measured" not in table
+    assert again_choices == choices
+    assert "because the recording" in choices and "measured" not in choices
     assert yaml.load(stored.read_text(), Loader=yaml.Loader) == again
 
 
@@ -121,7 +128,7 @@ def test_the_tables_name_what_there_is(recording: Path, tmp_path: Path):
     config = small_config(recording, tmp_path).resolved()
     with CONSOLE.capture() as captured:
         CONSOLE.print(recording_table(config.pipeline.datamanager.dataparser))
-        CONSOLE.print(choices_table(config.pipeline.resolution.choices))
+        CONSOLE.print(choices_text(config.pipeline.resolution.choices, 100))
     text = captured.get()
     for expected in ("32 x 24, pinhole", "11, 32 x 24, with depth", "blurred frames", "kept", "left out"):
         assert expected in text

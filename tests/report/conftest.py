@@ -7,6 +7,7 @@ import pytest
 from small_runs import SMALL
 
 from enerf_ns.method.runs import Run, method_config, train
+from enerf_ns.report import film, pictures
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -15,6 +16,13 @@ from enerf_ns.simulator.settings import SimulationSettings
 def no_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No test downloads weights."""
     monkeypatch.setenv("ENERF_LPIPS_WEIGHTS", str(tmp_path / "no-weights"))
+
+
+@pytest.fixture
+def short_films(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films of two pictures."""
+    monkeypatch.setattr(film, "MOVING_FRAMES", 2)
+    monkeypatch.setattr(pictures, "VIDEO_SECONDS", 0.1)
 
 
 @pytest.fixture(scope="session")
@@ -33,9 +41,9 @@ def run(recording: Path) -> Run:
 
 @pytest.fixture(scope="session")
 def run_without_frames(recording: Path) -> Run:
-    """The same of events alone."""
-    folder = recording.with_name("without_frames")
-    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth"))
+    """The same of events alone, of a sensor with unknown thresholds."""
+    folder = recording.with_name("events_alone")
+    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("images*", "depth", "simulation.json"))
     held_out = {"pipeline.datamanager.dataparser.held_out_every": 16, "pipeline.datamanager.held_out_events": 0.2}
     changes = {**SMALL, **held_out, "evaluation_share": 0.0}
     return train(method_config("enerf", folder, recording.parent / "runs", changes))

@@ -15,6 +15,7 @@ from matplotlib import colormaps
 from PIL import Image
 
 from enerf_ns.dataparsers.recording.errors import OutputError
+from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import Run
@@ -64,6 +65,25 @@ def test_depth_is_coloured_from_the_nearest_to_the_farthest():
 def test_gamma_is_told():
     assert PLAIN.gamma == "brightness"
     assert Screen(PLAIN.correct, 1 / 2.2, 1.0, 3.0).gamma == "brightness^(1/2.2)"
+
+
+def test_the_output_display_of_a_camera_is_what_the_report_shows(run: Run, capsys: pytest.CaptureFixture[str]):
+    """Of this size or another; one line says what it is."""
+    pipeline: Any = run.pipeline
+    views, _ = held_out_views(pipeline, shown_numbers(len(pipeline.datamanager.eval_dataset)))
+    screen = Screen.of(views, (1.0, 3.0))
+    capsys.readouterr()
+    pipeline.eval()
+    for scale in (1, 2):
+        camera = pipeline.datamanager.eval_dataset.cameras[:1].to(pipeline.device)
+        camera.rescale_output_resolution(scale)
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        assert outputs["display"].shape == (scale * 24, scale * 32, 3)
+        shown = (255 * outputs["display"]).round()
+        np.testing.assert_allclose(shown, screen.brightness(outputs["rgb"]).astype(float), atol=1)
+    (told,) = capsys.readouterr().out.splitlines()
+    assert told.startswith(f"display: {screen.gamma}, as in enerf report; 32 x 24 pixels")
+    assert not pipeline.training
 
 
 def test_the_moving_picture_shows_events_render_and_depth(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -118,6 +138,7 @@ def test_a_disk_too_small_for_the_video_is_one_sentence(run: Run, tmp_path: Path
     (tmp_path / "video.mp4").write_text("before")
     pipeline: Any = run.pipeline
     path = camera_path(pipeline.datamanager.eval_dataset.cameras)
+    path["camera_path"] = path["camera_path"][:3]
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:

@@ -8,17 +8,24 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from nerfstudio.cameras.cameras import Cameras
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.index.event_index import EventIndex, event_picture
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.metrics import KNOWN
 from enerf_ns.evaluation.views import HeldOutView
 from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import Run
-from enerf_ns.report.pictures import camera_path, shown_numbers, side_by_side
+from enerf_ns.report.pictures import camera_path, columns_of, side_by_side
+
+
+def figure_of(views: list[HeldOutView], recording: EventRecording, exponent: float = 1.0) -> Figure:
+    return side_by_side(columns_of(views, recording, exponent), views)
 
 
 def shown(run: Run) -> list[HeldOutView]:
@@ -37,7 +44,7 @@ def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
     recording, views = run.pipeline.datamanager.eval_dataset.recording, shown(run)
 
     def titles(views: list[HeldOutView], recording: EventRecording) -> list[str]:
-        figure = side_by_side(views, recording)
+        figure = figure_of(views, recording)
         named = [axis.get_title() for axis in figure.axes if axis.get_title()]
         assert sum(bool(axis.images) for axis in figure.axes) == len(named) * len(views)
         return named
@@ -56,7 +63,7 @@ def test_the_picture_has_a_column_for_each_thing_that_there_is(run: Run):
 
 def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run):
     views = shown(run)
-    figure = side_by_side(views, run.pipeline.datamanager.eval_dataset.recording)
+    figure = figure_of(views, run.pipeline.datamanager.eval_dataset.recording)
     pictures: Any = [axis.images[0] for axis in figure.axes[: 8 * len(views)]]
     for number, view in enumerate(views):
         row = pictures[8 * number : 8 * number + 8]
@@ -73,7 +80,7 @@ def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run)
 def test_depth_that_is_not_known_is_pale(run: Run):
     view = shown(run)[0]
     confidence = torch.linspace(0.0, 1.0, view.depth.numel()).view(view.depth.shape)
-    figure = side_by_side([replace(view, confidence=confidence)], run.pipeline.datamanager.eval_dataset.recording)
+    figure = figure_of([replace(view, confidence=confidence)], run.pipeline.datamanager.eval_dataset.recording)
     (depth,) = [axis.images[0] for axis in figure.axes if axis.get_title() == "rendered depth"]
     opacity = np.asarray(depth.get_alpha())
     assert (opacity[confidence[..., 0].numpy() >= KNOWN] == 1).all() and opacity[0, 0] < 0.3
@@ -83,7 +90,7 @@ def test_depth_that_is_not_known_is_pale(run: Run):
 
 def test_brightness_is_shown_to_a_power_and_nothing_else_is(run: Run):
     recording, views = run.pipeline.datamanager.eval_dataset.recording, shown(run)[:1]
-    as_it_is, brighter = (side_by_side(views, recording, exponent).axes for exponent in (1.0, 0.5))
+    as_it_is, brighter = (figure_of(views, recording, exponent).axes for exponent in (1.0, 0.5))
     for title, one, other in zip(ALL, as_it_is, brighter, strict=False):
         expected = np.asarray(one.images[0].get_array())
         if title in ("held-out frame", "blurred frame", "render"):
@@ -91,12 +98,29 @@ def test_brightness_is_shown_to_a_power_and_nothing_else_is(run: Run):
         np.testing.assert_allclose(np.asarray(other.images[0].get_array()), expected, atol=1e-6)
 
 
+def test_pictures_on_the_page_have_the_colours_of_the_figure(run: Run):
+    """Drawn by matplotlib at the size of the pixels, over the grey of unknown values."""
+    views = shown(run)[:1]
+    for column in columns_of(views, run.pipeline.datamanager.eval_dataset.recording):
+        (picture,) = column.pictures
+        assert picture is not None
+        height, width = picture.shape[:2]
+        figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="#c9ced8")
+        opacity: Any = None if column.opacities is None else column.opacities[0]
+        kept = {"cmap": column.colours, "vmin": column.limits[0], "vmax": column.limits[1]} if column.bar else {}
+        figure.figimage(picture, alpha=opacity, origin="upper", **kept)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        expected = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+        assert np.abs(expected - column.coloured(0)).max() <= 2, column.title
+
+
 def test_the_legend_has_the_colours_of_brighter_and_darker(run: Run):
     """By a picture of one event of each polarity."""
     events = Events(np.array([1, 2]), np.array([1, 1]), np.array([5, 6]), np.array([1, -1]))
     camera = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
     picture = event_picture(EventIndex.from_events(events, 4, 3), camera, 10)
-    figure = side_by_side(shown(run)[:1], run.pipeline.datamanager.eval_dataset.recording)
+    figure = figure_of(shown(run)[:1], run.pipeline.datamanager.eval_dataset.recording)
     (legend,) = [legend for axis in figure.axes if (legend := axis.get_legend())]
     colours = {
         text.get_text(): tuple(np.round(255 * np.array(patch.get_facecolor()[:3])).astype(int).tolist())

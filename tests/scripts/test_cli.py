@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -54,7 +55,7 @@ def test_the_version_is_that_of_the_package(monkeypatch, capsys: pytest.CaptureF
     assert capsys.readouterr().out == f"enerf-ns {version('enerf-ns')}\n"
 
 
-@pytest.mark.parametrize("name", ["nonsense", "--nonsense", "Report"])
+@pytest.mark.parametrize("name", ["nonsense", "--nonsense"])
 def test_what_is_no_command_is_one_sentence(name: str, monkeypatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(sys, "argv", ["enerf", name, "more"])
     with pytest.raises(SystemExit) as end:
@@ -63,6 +64,36 @@ def test_what_is_no_command_is_one_sentence(name: str, monkeypatch, capsys: pyte
     out, error = capsys.readouterr()
     assert (out, error.count("\n")) == ("", 1)
     assert error.startswith(f"enerf: There is no command {name}; choose one of bench, ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["Report"], "There is no command Report; the nearest is report."),
+        (["inspec"], "There is no command inspec; the nearest is inspect."),
+        (["simulate", "--widht", "3"], "There is no flag --widht; the nearest is --width. enerf simulate --help lists"),
+        (["simulate", "shapes", "--output_dri=x"], "There is no flag --output_dri; the nearest is --output-dir."),
+        (["inspect", "--outptu", "x"], "There is no flag --outptu; the nearest is --output."),
+    ],
+)
+def test_a_word_that_is_misspelt_is_told_in_a_sentence(
+    arguments: list[str], sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["enerf", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.entrypoint()
+    out, error = capsys.readouterr()
+    assert (end.value.code, out, error.count("\n")) == (2, "", 1)
+    assert error.startswith("enerf: ") and sentence in error
+
+
+def test_what_else_is_wrong_with_flags_is_told_by_tyro(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["enerf", "simulate", "shapes"])
+    with pytest.raises(SystemExit) as end:
+        cli.entrypoint()
+    assert end.value.code == 2 and "--output-dir PATH" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -102,11 +133,24 @@ def test_what_stops_it_from_outside_is_told(error: BaseException, code: object, 
     def stopped(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(cli.tyro, "cli", stopped)
+    monkeypatch.setattr("tyro.cli", stopped)
     monkeypatch.setattr(sys, "argv", ["enerf", "demo"])
     with pytest.raises(SystemExit) as end:
         cli.entrypoint()
     assert end.value.code == code
+
+
+@pytest.mark.parametrize("command", ["", "bench", "bench --help", "simulate shapes --output-dir new --width 16"])
+def test_it_ends_in_silence_when_the_reader_of_its_output_has_gone(command: str, tmp_path: Path):
+    """As with `enerf ... | head`, but before the first line. Printed by print, rich, tyro, and a bar of progress."""
+    read, write = os.pipe()
+    os.close(read)
+    words = [Path(sys.executable).with_name("enerf"), *command.split()]
+    if "simulate" in words:
+        words += ["--height", "12", "--duration", "0.05", "--num-frames", "11"]
+    ended = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, cwd=tmp_path, timeout=100)
+    os.close(write)
+    assert ended.returncode != 0 and ended.stderr == ""
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="what a process has loaded is told by Linux")

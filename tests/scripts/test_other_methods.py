@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ import torchvision
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
-from test_tools import RECORDINGS, call, check_video, contents, start  # noqa: F401 - call is a fixture
+from test_tools import RECORDINGS, call, check_video, contents  # noqa: F401 - call is a fixture
+from warm_commands import WarmCommands
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.formats.tum_vie import TumVieOptions
@@ -41,11 +42,13 @@ METHODS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def lpips_without_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nerfstudio's methods download weights for LPIPS, a score that is not looked at here."""
-    random = torchvision.models.alexnet
-    monkeypatch.setattr(torchvision.models, "alexnet", lambda **_: random(weights=None))
+@pytest.fixture(autouse=True, scope="module")
+def no_weights_of_lpips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """There are none, neither in torchvision's folder nor at the address from which it downloads them."""
+    folder = tmp_path_factory.mktemp("nothing")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torchvision.models.AlexNet_Weights.DEFAULT.value, "url", (folder / "alexnet.pth").as_uri())
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +67,6 @@ def nerfacto(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """config.yml of a run of nerfacto."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("runs"))
-        random = torchvision.models.alexnet
-        patch.setattr(torchvision.models, "alexnet", lambda **_: random(weights=None))
         return train("nerfacto", recording, patch)
 
 
@@ -89,16 +90,21 @@ def test_methods_train_on_sharp_frames_and_are_scored(
     recording: Path,
     monkeypatch: pytest.MonkeyPatch,
     method: str,
+    capsys: pytest.CaptureFixture[str],
 ):
     before = contents(recording)
     config = train(method, recording, monkeypatch)
     pipeline: Any = eval_setup(config)[1]
+    capsys.readouterr()
     manager = pipeline.datamanager
     shown = manager.train_dataset.get_numpy_image(0)
     np.testing.assert_array_equal(shown, np.asarray(Image.open(recording / "images/00000.png").convert("RGB")))
     assert len(manager.eval_dataset) == NUM_HELD_OUT
     call("ns-eval", "--load-config", config, "--output-path", "scores.json")
-    assert 3 < json.loads(Path("scores.json").read_text())["results"]["psnr"] < 60
+    scores = json.loads(Path("scores.json").read_text())["results"]
+    assert 3 < scores["psnr"] < 60 and np.isnan(scores["lpips"])
+    printed = capsys.readouterr().out
+    assert printed.count("lpips is left out (nan): its weights cannot be downloaded; get them by enerf") == 1
     assert contents(recording) == before
 
 
@@ -167,10 +173,10 @@ def test_views_for_evaluation_alone_are_nothing_to_train_on(tmp_path: Path):
         config.setup().get_dataparser_outputs("train")
 
 
-def test_without_frames_a_sentence_says_what_to_do(recording: Path, tmp_path: Path):
+def test_without_frames_a_sentence_says_what_to_do(recording: Path, tmp_path: Path, warm_commands: WarmCommands):
     shutil.copytree(recording, tmp_path / "events", ignore=shutil.ignore_patterns("images*", "depth"))
-    trained = start("ns-train", "nerfacto", *STEPS, "event-data", "--data", "events", cwd=tmp_path)
-    assert trained.returncode != 0 and "Traceback" not in trained.stderr
-    said = " ".join(trained.stderr.split())
+    code, printed = warm_commands.run("ns-train", "nerfacto", *STEPS, "event-data", "--data", "events", cwd=tmp_path)
+    assert code != 0 and "Traceback" not in printed
+    said = " ".join(printed.split())
     assert "events holds no frames to train on" in said and "ns-train enerf --data" in said
     assert not (tmp_path / "outputs").is_dir() or not list((tmp_path / "outputs").rglob("*.ckpt"))

@@ -291,7 +291,7 @@ def test_a_map_solves_what_it_observed_with_what_was_known_before():
     """Of single pixels, by NumPy's least squares; of one of which nothing is known or seen, nothing is said."""
     generator = np.random.default_rng(4)
     known, variance = np.array([0.08, -0.02, 0.0]), np.array([1e-4, 1e-2, np.inf])
-    on, off = generator.integers(1, 6, (2, 2, SOLVED_EVERY))
+    on, off = generator.integers([[[3]], [[1]]], [[[9]], [[3]]], (2, 2, SOLVED_EVERY))
     residual = 0.1 * generator.standard_normal((2, SOLVED_EVERY))
     solver = ThresholdMap(3)
     solver.start_from(torch.from_numpy(known).float(), torch.from_numpy(variance).float())
@@ -303,7 +303,7 @@ def test_a_map_solves_what_it_observed_with_what_was_known_before():
         ups, downs, left = (torch.from_numpy(column[:, step]) for column in (on, off, residual.astype(np.float32)))
         solver.observe(pixels, ups, downs, left, (1.0, 1.0))
     weights = np.arange(1, SOLVED_EVERY + 1) / SOLVED_EVERY
-    running, found = 1.0, []
+    running, found, errors = 1.0, [], []
     for step in range(SOLVED_EVERY):
         running += ((residual[:, step] ** 2).mean() - running) / (step + 1)
         weights[step] /= np.sqrt(max(running, 1e-6))
@@ -312,9 +312,14 @@ def test_a_map_solves_what_it_observed_with_what_was_known_before():
         ridge = np.diag(1.0 / spread.double().numpy())
         difference = np.array([[1.0, -1.0]]) / np.sqrt(variance[pixel])
         right = [residual[pixel] * weights, known[pixel : pixel + 1] / np.sqrt(variance[pixel]), np.zeros(2)]
-        found.append(np.linalg.lstsq(np.concatenate([rows, difference, ridge]), np.concatenate(right), rcond=None)[0])
+        equations = np.concatenate([rows, difference, ridge])
+        found.append(np.linalg.lstsq(equations, np.concatenate(right), rcond=None)[0])
+        errors.append(np.linalg.inv(equations.T @ equations).diagonal())
     expected = np.array(found) - np.mean(found, axis=0)
     np.testing.assert_allclose(solver.deviations[:2].numpy(), expected, atol=1e-4)
+    expected = np.sqrt(np.mean(expected**2 + errors, axis=0))
+    assert expected[1] > 1.05 * expected[0], "the thresholds of the rarer events are known worse"
+    np.testing.assert_allclose(solver.spread.numpy(), expected, rtol=1e-3)
 
 
 def test_pixels_that_are_alike_stay_so():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,17 +60,26 @@ def test_between_frames_exposure_is_interpolated_in_time():
     assert exposure.at(-50) == pytest.approx(exposure.at(0)) and exposure.at(500) == pytest.approx(exposure.at(200))
 
 
+WHOLE: tuple[dict[str, Any], dict[str, Any]] = {}, {"max_num_iterations": 400}
+SMALL: tuple[dict[str, Any], dict[str, Any]] = (
+    {"width": 64, "height": 48, "duration": 0.5, "num_frames": 11},
+    {"max_num_iterations": 300, "pipeline.datamanager.event_pairs": 256},
+)
+"""What is simulated, and how it is trained: as the demo is, and smaller."""
+
+
 @pytest.mark.slow
-def test_a_training_beside_frames_finds_how_each_was_exposed(tmp_path: Path):
+@pytest.mark.parametrize("size", [SMALL, pytest.param(WHOLE, marks=pytest.mark.exhaustive)], ids=["small", "whole"])
+def test_a_training_beside_frames_finds_how_each_was_exposed(tmp_path: Path, size: tuple[dict, dict]):
     """Nobody says that exposure changes; the offsets stay small, since there are none."""
-    folder = tmp_path / "shapes"
-    simulate(SimulationSettings("shapes", layout="event_recording"), folder)
+    folder, (simulated, trained) = tmp_path / "shapes", size
+    simulate(SimulationSettings("shapes", layout="event_recording", **simulated), folder)
     files = sorted((folder / "frames").glob("*.png"))
     gains = np.random.default_rng(0).uniform(0.6, 1.0, len(files))
     for file, gain in zip(files, gains, strict=True):
         Image.fromarray((gain * np.asarray(Image.open(file)) + 0.5).astype(np.uint8)).save(file)
     changes = {
-        "max_num_iterations": 400,
+        **trained,
         "evaluation_share": 0.0,
         "pipeline.datamanager.supervision": "events+frames",
         "pipeline.datamanager.dataparser.train_frames": "sharp",

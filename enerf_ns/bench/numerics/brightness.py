@@ -67,7 +67,7 @@ def _outside(predicted: Tensor, measured: Tensor) -> int:
     predicted = predicted.requires_grad_()
     loss = normalised_event_loss(predicted, measured)
     (gradient,) = torch.autograd.grad(loss, predicted)
-    return int(not 0.0 <= float(loss) <= 4.0) + int((~gradient.isfinite()).sum())
+    return int(not 0.0 <= loss.item() <= 4.0) + int((~gradient.isfinite()).sum())
 
 
 @case("silent pixels that change by exactly nothing", "no loss, a finite gradient")
@@ -75,4 +75,4 @@ def silent_at_zero() -> float:
     predicted = torch.zeros(8, requires_grad=True)
     loss = no_event_loss(predicted, (0.2, 0.3), margin=0.0)
     (gradient,) = torch.autograd.grad(loss, predicted)
-    return float(loss) + int((~gradient.isfinite()).sum())
+    return loss.item() + int((~gradient.isfinite()).sum())

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch import Tensor
 
 from enerf_ns.bench.numerics.case import case
@@ -172,5 +173,5 @@ def damaged_checkpoint() -> float:
 
 def _step(trainer: Any, step: int) -> None:
     trainer.train_iteration(step)
-    for callback in trainer.callbacks:
-        callback.func(step)
+    for callback in trainer.callbacks:  # those of the end of a training would evaluate the run
+        callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
@@ -10,6 +12,9 @@ from torch import Tensor
 from enerf_ns.dataparsers.index.event_index import OFF_COLOUR, ON_COLOUR, EventIndex
 from enerf_ns.dataparsers.recording.camera import Camera
 
+SQUARES, DARKER = 40, 0.8
+"""Number of squares along the longer side of a picture where nothing is known, and brightness of the darker ones."""
+
 EVENT_OPACITY = 0.75
 """Opacity of an event that is drawn on a pixel."""
 
@@ -17,20 +22,28 @@ MOSTLY_EVENT = 96
 """Least part of an undistorted pixel, of 255, that events must cover to be drawn there."""
 
 
-def for_the_eye(
-    brightness: Float[Tensor, "*batch 3"], stops: float, gamma: float, share: Float[Tensor, "*batch 1"], behind: Tensor
-) -> Float[Tensor, "*batch 3"]:
+def for_the_eye(brightness: Float[Tensor, "*batch 3"], stops: float, gamma: float) -> Float[Tensor, "*batch 3"]:
     """Brightness as a display shows it: doubled by each stop, to the power 1 / gamma, clipped to [0, 1].
 
     Args:
         brightness: Rendered brightness, 0 or more.
         stops: Stops of exposure, of any sign.
         gamma: Exponent above 0; with 1, brightness stays linear.
-        share: Accumulation of each ray, in [0, 1].
-        behind: Colour of the background, shape (3,).
     """
-    seen = (brightness * 2.0**stops).clamp(0.0, 1.0) ** (1.0 / gamma)
-    return (seen + (1.0 - share) * behind).clamp(max=1.0)
+    return (brightness * 2.0**stops).clamp(0.0, 1.0) ** (1.0 / gamma)
+
+
+def unknown(size: Sequence[int], colour: tuple[int, int, int]) -> Float[Tensor, "height width 3"]:
+    """A picture of squares in a colour and a darker one, shown where nothing is known: no scene looks like that.
+
+    Args:
+        size: Height and width in pixels.
+        colour: Colour of the lighter squares, 0 to 255.
+    """
+    side = max(1, round(max(size) / SQUARES))
+    rows, columns = (torch.arange(number) // side for number in size)
+    is_dark = (rows[:, None] + columns) % 2 == 1
+    return torch.tensor(colour) / 255.0 * torch.where(is_dark, DARKER, 1.0)[..., None]
 
 
 def recent_events(index: EventIndex, camera: Camera, first: int, last: int) -> UInt8[np.ndarray, "height width 2"]:

@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.datamanager import EnerfDataManager
 from enerf_ns.method.model import EnerfModel, Outputs
 from enerf_ns.method.nerfstudio_seams import replace_camera_callbacks, replace_renderer, tidy_control_panel
-from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events
+from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events, unknown
 from enerf_ns.method.viewer.seen_rays import SeenRays
 from enerf_ns.method.viewer.view_renderer import ViewRenderer
 
@@ -62,6 +62,12 @@ LOOKED_EVERY = 1.1
 ACCENT = (255, 211, 105)
 """Colour of the trajectory and the sensor."""
 
+NERFSTUDIO_BACKGROUND, UNKNOWN = (38, 42, 55), (100, 100, 100)
+"""Background colour of Nerfstudio's viewer, and the colour here of the lighter squares where nothing was seen."""
+
+PAUSE = 0.1
+"""Seconds after a move of a view in which training pauses."""
+
 STATED = (150, 150, 150)
 """Colour of the trajectory before corrections."""
 
@@ -79,20 +85,42 @@ class SceneView(ViewerControl):
         self._seen: SeenRays | None = None
         self._seen_at = self._looked_at = 0  # training steps
         self._level = 0.0  # stops
-        self._moves = threading.Lock()
+        self._moves, self._turn_to_render = threading.Lock(), threading.Lock()
 
     def _setup(self, viewer: Viewer) -> None:
+        """Fills the viewer. The panel comes first, for browsers that are there before the scene."""
         super()._setup(viewer)
-        outputs = self._manager.train_dataparser_outputs
+        outputs, dataset = self._manager.train_dataparser_outputs, self._manager.train_dataset
         self._transform, self._scale = outputs.metadata["transform"].numpy(), outputs.dataparser_scale
         self._camera = self._recording.camera.undistorted()
+        self._middle = int(np.argsort(dataset.frames.times)[len(dataset) // 2])
+        self._add_panel()
+        if viewer.trainer is None:
+            viewer.pause_train.visible = viewer.resume_train.visible = False
         self._look_from_the_middle()
         if viewer.trainer is None:
             self._seen = self._seen_now()
         self._tidy_up()
         self._draw_recording()
-        self._add_panel()
+        self._listen()
+        self._state.content = ""
         self.viser_server.on_client_connect(self._open)
+
+    def after_step(self, step: int) -> None:
+        """Tells the viewer the step of training. A picture that waits is rendered first, and training pauses while a
+        view moves."""
+        viewer = self.viewer
+        viewer.step = step
+        with self._turn_to_render:
+            pass
+        while viewer.render_statemachines and time.time() - viewer.last_move_time < PAUSE:
+            time.sleep(0.01)
+
+    def end(self, step: int, sentence: str) -> None:
+        """Says in all browsers that training has ended, after its last step."""
+        self.viewer.step = step
+        self.viewer.pause_train.visible = self.viewer.resume_train.visible = False
+        self._state.content = sentence
 
     @property
     def _recording(self) -> EventRecording:
@@ -100,9 +128,8 @@ class SceneView(ViewerControl):
         return self._manager.recording
 
     def _look_from_the_middle(self) -> None:
-        """Finds the first view, which is that of the middle camera in time, and its depth."""
+        """Finds the depth of the first view, which is that of the middle camera in time."""
         dataset, model = self._manager.train_dataset, self._model
-        self._middle = int(np.argsort(dataset.frames.times)[len(dataset) // 2])
         camera = dataset.cameras[self._middle : self._middle + 1].to(model.device)
         camera.rescale_output_resolution(LOOK_WIDTH / float(camera.width))
         self._look_camera = camera
@@ -129,12 +156,12 @@ class SceneView(ViewerControl):
             viewer.config.camera_frustum_scale = FRUSTUM * self._depth * VISER_NERFSTUDIO_SCALE_RATIO
         if viewer.config.max_num_display_images == defaults.max_num_display_images:
             viewer.config.max_num_display_images = MOST_CAMERAS
+        if viewer.control_panel.background_color == NERFSTUDIO_BACKGROUND:
+            viewer.control_panel.background_color = UNKNOWN
         tidy_control_panel(viewer.control_panel, FULL_WIDTH)
-        if viewer.trainer is None:
-            viewer.pause_train.visible = viewer.resume_train.visible = False
 
     def _draw_recording(self) -> None:
-        """Draws the trajectory, and the sensor on it."""
+        """Draws the trajectory, and the sensor on it at the time of the slider."""
         self._drawn = [
             self.viser_server.scene.add_frame("/cameras", show_axes=False),
             self.viser_server.scene.add_frame("/recording", show_axes=False),
@@ -147,6 +174,7 @@ class SceneView(ViewerControl):
             scale=self.viewer.config.camera_frustum_scale,
             color=ACCENT,
         )
+        self._place_sensor(self._pose(self._moment))
 
     def _draw_path(self) -> None:
         """Draws the trajectory with its current corrections, and in grey the stated one if it differs."""
@@ -167,10 +195,13 @@ class SceneView(ViewerControl):
             )
 
     def _add_panel(self) -> None:
+        """Adds the folder of the recording."""
         gui, (first, last) = self.viser_server.gui, np.array(self._recording.span) * 1e-9
         step = 10.0 ** np.floor(np.log10((last - first) / 500.0))
         begin = step * round(self._manager.train_dataset.frames.times[self._middle] * 1e-9 / step)
         with gui.add_folder("Recording", order=self.viewer.stats_markdown.order + 0.5):
+            self._state = gui.add_markdown("Loading the scene …")
+            self._first_view = gui.add_button("First view", hint="Go back to the view at the beginning")
             self._time = gui.add_slider("Time (s)", first, last, step, begin, hint="A moment of the recording")
             self._plays = gui.add_checkbox("Play", False, hint="Move along the trajectory, over and over")
             self._follows = gui.add_checkbox("Follow", True, hint="Look from where the sensor was at that moment")
@@ -180,23 +211,31 @@ class SceneView(ViewerControl):
             self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
             self._depths = gui.add_markdown("")
             self._corrected = gui.add_markdown(self._corrections_in_words)
+
+    def _listen(self) -> None:
+        """Makes the folder do what it says, from the moment that the scene is there."""
         for handle in (self._events, self._window, self._stops, self._gamma):
             handle.on_update(lambda _: self._render())
         self._time.on_update(lambda _: self._move())
         self._follows.on_update(lambda _: self._move())
         self._plays.on_update(lambda _: threading.Thread(target=self._play, daemon=True).start())
-        self._move()
+        self._first_view.on_click(lambda event: event.client and self._show_first_view(event.client))
 
     def _open(self, client: viser.ClientHandle) -> None:
         """Shows a browser the first view, and renders for it from now on."""
-        renderer = ViewRenderer(self.viewer, client, self._rays_per_second, self._limit, self._shown)
+        renderer = ViewRenderer(
+            self.viewer, client, self._turn_to_render, self._rays_per_second, self._limit, self._shown
+        )
         replace_renderer(self.viewer, client, renderer)
+        self._show_first_view(client)
+        replace_camera_callbacks(client, self._moved)
+        renderer.start()
+
+    def _show_first_view(self, client: viser.ClientHandle) -> None:
+        """Turns a browser to the view a little behind the middle training camera."""
         pose = self._manager.train_dataset.cameras.camera_to_worlds[self._middle].cpu().double().numpy()
         back = pose[:, 2]
         self._turn(client, pose[:, 3] + BEHIND * self._depth * back, pose[:, 3] - self._depth * back, self._up)
-        replace_camera_callbacks(client, self._moved)
-        self.viewer.update_step(self.viewer.step)
-        renderer.start()
 
     def _turn(self, client: viser.ClientHandle, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
         """Moves the camera of a browser to a position, and points it at a target."""
@@ -208,7 +247,8 @@ class SceneView(ViewerControl):
 
     def _moved(self, view: viser.CameraHandle) -> None:
         """Renders for a browser whose camera has moved, unless it has gone since."""
-        if view.client.client_id in self.viewer.render_statemachines:
+        renderer = self.viewer.render_statemachines.get(view.client.client_id)
+        if isinstance(renderer, ViewRenderer) and renderer.has_moved(view):
             self._fit(view)
             self.viewer.last_move_time = time.time()  # type: ignore - starts as an int
             self._render_for(view.client)
@@ -256,13 +296,16 @@ class SceneView(ViewerControl):
         """
         with self._moves:
             pose = self._pose(self._moment)
-            with self.viser_server.atomic():
-                self._sensor.position = pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
-                self._sensor.wxyz = vtf.SO3.from_matrix(pose[:, :3]).wxyz
+            self._place_sensor(pose)
             if self._follows.value:
                 for client in self.viser_server.get_clients().values():
                     self._turn(client, pose[:, 3], pose[:, 3] + self._depth * pose[:, 2], -pose[:, 1])
         self._render()
+
+    def _place_sensor(self, pose: Float64[np.ndarray, "3 4"]) -> None:
+        with self.viser_server.atomic():
+            self._sensor.position = pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+            self._sensor.wxyz = vtf.SO3.from_matrix(pose[:, :3]).wxyz
 
     def _play(self) -> None:
         """Advances the time until "Play" is switched off. After the end it starts again."""
@@ -277,21 +320,22 @@ class SceneView(ViewerControl):
         assert self._model.seen_volume is not None
         return SeenRays(self._model.seen_volume())
 
-    def _limit(self, rays: RayBundle, at_rest: bool) -> None:
+    def _limit(self, rays: RayBundle, is_whole: bool) -> None:
         """Limits the rays of a picture to the seen volume, and updates what training has changed.
 
         Args:
             rays: Rays of shape (height, width); nears and fars that are set are only narrowed.
-            at_rest: Whether the view rests, so that there is time to compute the seen volume.
+            is_whole: Whether the view rests and its picture is the largest, so that there is time to compute the seen
+                volume.
         """
         step, model = self.viewer.step, self._model
         if self.viewer.trainer is not None and step >= LOOKED_EVERY * self._looked_at:
             self._look()
             self._looked_at = max(step, 1)
-        if at_rest and self.viewer.trainer is not None and step >= max(FIRST_SEEN, SEEN_EVERY * self._seen_at):
+        if is_whole and self.viewer.trainer is not None and step >= max(FIRST_SEEN, SEEN_EVERY * self._seen_at):
             self._seen = self._seen_now()
             self._seen_at = step
-        if at_rest and self._manager.corrections is not self._path_of:
+        if is_whole and self._manager.corrections is not self._path_of:
             self._draw_path()
             self._corrected.content = self._corrections_in_words
         if self._seen is None or model.config.contraction:
@@ -310,17 +354,19 @@ class SceneView(ViewerControl):
         """
         rgb, depth, share = outputs["rgb"], outputs["depth"], outputs["accumulation"]
         points = rays.origins + rays.directions * depth
-        if self._seen is not None and not self._model.config.contraction:
-            is_seen = self._seen.may_be_surface(points)[..., None]
-            rgb, share = rgb * is_seen, share * is_seen
-        behind = rgb.new_tensor(self.viewer.control_panel.background_color) / 255.0
-        rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value, share, behind)
+        is_known = torch.ones_like(share, dtype=torch.bool)
+        if self._seen is not None:
+            beyond = bool(self._model.config.contraction)  # whether space beyond the box is rendered, too
+            is_known = (share > 0.5) & self._seen.may_be_surface(points, beyond)[..., None]
+            rgb = rgb / share.clamp(min=0.5)
+        rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value)
+        rgb = rgb.where(is_known, unknown(rgb.shape[:2], self.viewer.control_panel.background_color).to(rgb))
         if self._events.value:
             moment = self._moment
             begin = moment - round(self._window.value * 1e6)
             events = recent_events(self._manager.index, self._recording.camera, begin, moment)
             rgb = draw_events(rgb, points, events, self._camera, self._pose(moment))
-        shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, share > 0.5)})
+        shown = Outputs(outputs | {"rgb": rgb, "depth": self._in_metres(depth, is_known & (share > 0.5))})
         path = torch.from_numpy(self._path).to(rays.origins)
         away = float((path - rays.origins[0, 0]).norm(dim=-1).min())
         for handle in self._drawn:  # near the trajectory, drawn lines and cameras hide the scene

@@ -35,9 +35,18 @@ class SeenRays:
         padded = torch.nn.functional.max_pool3d(seen.is_seen[None].float(), 3, stride=1, padding=1)
         self._around = replace(seen, is_seen=padded[0] > 0.0)
 
-    def may_be_surface(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Whether points (scene units) lie in seen voxels, or in voxels that touch seen ones."""
-        return self._around.seen(points)
+    def may_be_surface(self, points: Float[Tensor, "*batch 3"], beyond: bool = False) -> Bool[Tensor, "*batch"]:
+        """Whether points (scene units) lie in seen voxels, or in voxels that touch seen ones.
+
+        Args:
+            points: Points in the scene.
+            beyond: Whether points beyond the box, of which the seen volume says nothing, count, too.
+        """
+        found = self._around.seen(points)
+        if beyond:
+            low, high = self._seen.aabb
+            found = found | ((points < low) | (points > high)).any(dim=-1)
+        return found
 
     def span(
         self, origins: Float[Tensor, "height width 3"], directions: Float[Tensor, "height width 3"]

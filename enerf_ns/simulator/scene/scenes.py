@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 from trimesh.transformations import rotation_matrix, transform_points
 
-from enerf_ns.sensor.response import LUMA
+from enerf_ns.dataparsers.recording.picture_depth import LUMA
 from enerf_ns.simulator.scene import textures
 
 LIGHT = np.array([-0.4, -0.7, 0.6]) / np.linalg.norm([-0.4, -0.7, 0.6])

@@ -24,7 +24,12 @@ def test_columns_of_one_length_and_of_whole_numbers_are_right():
     [
         (
             {"t": np.zeros(3)},
-            r"holds t as float64 of shape \(3,\), but .* \(t in µs\) was expected; save it with .*int64",
+            r"holds t as float64 of shape \(3,\), but .* \(t in microseconds\) was expected; save it with .*int64",
+        ),
+        (
+            {name: np.linspace(0, 0.5, 10**5) if name == "t" else np.zeros(10**5, int) for name in "xytp"},
+            r"holds t as float64, up to 0\.5, which look like seconds, but whole microseconds were expected; save "
+            r"np\.rint\(t \* 1e\+06\)\.astype\(np\.int64\)\.",
         ),
         ({"x": np.zeros(3, bool)}, "holds x as bool"),
         ({"y": np.zeros((3, 1), int)}, r"holds y as int64 of shape \(3, 1\)"),
@@ -34,16 +39,21 @@ def test_columns_of_one_length_and_of_whole_numbers_are_right():
 )
 def test_other_columns_are_refused(changed: dict[str, np.ndarray], words: str):
     with pytest.raises(RecordingError, match=rf"^events\.h5 {words}"):
-        check_columns(FILE, columns(**changed), "µs")
+        check_columns(FILE, columns(**changed), "us")
 
 
-@pytest.mark.parametrize(("unit", "limit"), [("ns", LATEST), ("µs", LATEST // 1000)])
-def test_times_lie_within_146_years(unit: str, limit: int):
+@pytest.mark.parametrize(("unit", "limit", "named"), [("ns", LATEST, "nano"), ("us", LATEST // 1000, "micro")])
+def test_times_lie_within_146_years(unit: str, limit: int, named: str):
     check_times(FILE, np.array([1 - limit, limit - 1]), unit)
     check_times(FILE, np.array([limit], np.uint64), unit, offset=-1)
     for times, offset in (([limit], 0), ([-limit], 0), ([limit - 1], 1)):
-        with pytest.raises(RecordingError, match=f"{unit}, which is beyond 146 years; times in {unit} were expected"):
+        with pytest.raises(RecordingError, match=f"{unit}, which is beyond 146 years; {named}seconds were expected"):
             check_times(FILE, np.array(times), unit, offset)
+
+
+def test_a_date_in_another_unit_is_named():
+    with pytest.raises(RecordingError, match=r"these look like nanoseconds, so divide them by 1,000\."):
+        check_times(FILE, np.array([1_700_000_000 * 10**9]), "us")
 
 
 def test_poses_beyond_all_measure_are_refused_by_their_place():

@@ -604,11 +604,11 @@ RAW_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty poses": (write(POSES, ""), f"{POSES} is empty"),
     "poses in us": (edit(POSES, lambda lines: rescale(lines, 1e6, slice(None))), "which is beyond 146 years"),
     "one pose in us": (edit(POSES, lambda lines: rescale(lines, 1e6, slice(50, 51))), "which is beyond 146 years"),
-    "poses in ks": (edit(POSES, lambda lines: rescale(lines, 1e-3, slice(None))), "must be on one clock"),
+    "poses in ks": (edit(POSES, lambda lines: rescale(lines, 1e-3, slice(None))), "does not fit together"),
     "late poses": (edit(POSES, lambda lines: rescale(lines, 1.01, slice(50, None))), "which does not fit together"),
     "events in ns": (lambda folder: shift_events(folder, 999 * EPOCH), "which is beyond 146 years"),
     "events of another day": (lambda folder: shift_events(folder, 86400 * 10**6), "must be on one clock"),
-    "stamps in s": (edit(STAMPS, lambda lines: rescale(lines, 1e-6, slice(None))), "must be on one clock"),
+    "stamps in s": (edit(STAMPS, lambda lines: rescale(lines, 1e-6, slice(None))), "look like seconds, but micro"),
     "no stamps": (without(STAMPS), f"holds 3 images, but {STAMPS} and {STAMPS_US} are missing"),
     "a stamp too few": (edit(STAMPS, lambda lines: lines.pop()), "holds 3 images, but "),
     "an image too few": (without("images/frame_0000000001.png"), "holds 2 images, but "),
@@ -652,7 +652,7 @@ def test_a_fault_in_an_unpacked_recording(raw: Path, damage: Callable[[Path], ob
 
 
 PREPARED_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "poses in s": (edit(POSES_US, lambda lines: rescale(lines, 1e-6, slice(None))), "must be on one clock"),
+    "poses in s": (edit(POSES_US, lambda lines: rescale(lines, 1e-6, slice(None))), "look like seconds, but micro"),
     "poses in ns": (edit(POSES_US, lambda lines: rescale(lines, 1e3, slice(None))), "which does not fit together"),
     "late poses in ns": (edit(POSES_US, lambda lines: rescale(lines, 1e3, slice(50, None))), "does not fit together"),
     "one pose in s": (edit(POSES_US, lambda lines: rescale(lines, 1e-6, slice(50, 51))), "line 51 has the time"),

@@ -477,9 +477,12 @@ BAD_INPUT = {
     ),
     "events in microseconds": (
         save(EVENTS_FILE, timestamp=events()["timestamp"] // 1000),
-        "does not fit together; state the times of both in the unit",
+        "the times of events (raw_events.npz) look like microseconds, but nanoseconds were expected, so multiply them",
     ),
-    "poses in microseconds": (save(POSES_FILE, T_wc_timestamp=TIMES // 1000), "does not fit together; state the times"),
+    "poses in microseconds": (
+        save(POSES_FILE, T_wc_timestamp=TIMES // 1000),
+        "the times of poses (camera_poses.npz) look like microseconds, but nanoseconds were expected, so multiply them",
+    ),
     "poses in seconds": (
         save(POSES_FILE, T_wc_timestamp=TIMES // 10**9),
         "holds 40 poses, but 39 of them follow another one within 1 µs; give one pose for each time, and times in nano",

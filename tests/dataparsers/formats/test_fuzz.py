@@ -887,8 +887,12 @@ FOUND: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "header of bytes": ("esim", patch("events/00000.npy", b" 'shape'", b"b'shape'"), "cannot be read as a NumPy array"),
     "zip without contents": ("esim", write("events/00000.npy", b"PK\x03\x04" + bytes(99)), "cannot be read as a NumPy"),
     "x that wraps": ("esim", save_rows(2**32 + 3), "event 6 holds x = 4.29497e+09, where a whole number"),
-    "stamps in µs": ("esim", scale_stamps("images/image_stamps_ns.txt", 1e-3), "frames within 0.0006 s and poses"),
-    "stamps in ps": ("esim", scale_stamps("images_corrupted/image_stamps_ns.txt", 1e3), "blurred frames within 600 s"),
+    "stamps in µs": (
+        "esim",
+        scale_stamps("images/image_stamps_ns.txt", 1e-3),
+        "frames (image_stamps_ns.txt) look like micro",
+    ),
+    "stamps in ps": ("esim", scale_stamps("images_corrupted/image_stamps_ns.txt", 1e3), "3 frames within 600 s"),
     "truth for a number": (
         "esim",
         change("simulation.json", "camera", "cx", value=True),

@@ -157,7 +157,7 @@ def without(name: str) -> dict[str, np.ndarray]:
         ({}, "lacks the datasets x, y, t, p in its root"),
         (
             columns() | {"t": columns()["t"] * 1e-6},
-            "holds t as float64 of shape (5000,), but one whole number for each event (t in µs)",
+            "which look like seconds, but whole microseconds were expected; save np.rint(t * 1e+06).astype(np.int64)",
         ),
         (columns() | {"x": columns()["x"].astype(np.float32)}, "holds x as float32"),
         (columns() | {"x": columns()["x"] > 3}, "holds x as bool"),
@@ -167,8 +167,8 @@ def without(name: str) -> dict[str, np.ndarray]:
         (columns() | {"y": columns()["y"][:, None]}, "holds y as uint16 of shape (5000, 1), but one whole number"),
         (columns() | {"y": np.uint16(3)}, "holds y as uint16 of shape (), but one whole number"),
         (columns(0), "holds no events"),
-        (columns() | {"t": columns()["t"] * 1000}, "µs, which is beyond 146 years"),
-        (columns() | {"t": np.full(NUM_EVENTS, 2**64 - 1, np.uint64)}, "µs, which is beyond 146 years"),
+        (columns() | {"t": columns()["t"] * 1000}, "these look like nanoseconds, so divide them by 1,000"),
+        (columns() | {"t": np.full(NUM_EVENTS, 2**64 - 1, np.uint64)}, "us, which is beyond 146 years"),
     ],
 )
 def test_columns_of_another_kind(tmp_path: Path, data: dict, message: str):
@@ -182,7 +182,7 @@ def test_a_time_beyond_all_measure_in_the_middle(tmp_path: Path):
     data = columns()
     data["t"][2500] = 2**62
     events = Hdf5Events(write(tmp_path / "events.h5", data=data))
-    with pytest.raises(RecordingError, match=f"holds the time {2**62} µs, which is beyond 146 years"):
+    with pytest.raises(RecordingError, match=f"holds the time {2**62} us, which is beyond 146 years"):
         read(events)
 
 

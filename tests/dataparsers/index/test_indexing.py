@@ -80,6 +80,26 @@ def test_an_error_of_an_event_names_its_number(row: list[int], message: str):
         index_events(recording(np.array([[1, 2, 5, 1], row, [1, 2, 9, 1]])))
 
 
+@pytest.mark.parametrize(
+    ("largest", "centre", "said"),
+    [
+        ((17, 23), (11.5, 8.5), "x and y of the events seem to be swapped: exchange the two columns"),
+        ((17, 23), (8.5, 11.5), "width and height of the calibration seem to be swapped: exchange them"),
+        ((24, 18), (11.5, 8.5), "coordinates seem to start at 1: subtract 1 from both"),
+        ((47, 35), (11.5, 8.5), "give the calibration of this resolution of the sensor"),
+    ],
+)
+def test_why_events_lie_outside_is_named(largest: tuple[int, int], centre: tuple[float, float], said: str):
+    times = np.arange(3000)
+    x, y = (times // (top + 1) % (top + 1) if i else times % (top + 1) for i, top in enumerate(largest))
+    read = recording(np.column_stack([x, y, times, times % 2]), end=10**9)
+    camera = Camera(WIDTH, HEIGHT, 20.0, 20.0, *centre)
+    with pytest.raises(RecordingError) as error:
+        index_events(replace(read, camera=camera))
+    assert f"; all x lie below {largest[0] + 1} and all y below {largest[1] + 1}" in str(error.value)
+    assert str(error.value).endswith(f" {said}.")
+
+
 def test_events_that_make_no_pair_are_refused():
     with pytest.raises(RecordingError, match="never two at one pixel"):
         index_events(recording(np.array([[1, 2, 5, 1], [2, 2, 6, 1]])))

@@ -17,6 +17,7 @@ from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaki
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import agreement as agreement_module
 from enerf_ns.dataparsers.inspection.agreement import Agreement
+from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
@@ -115,6 +116,10 @@ def test_a_calibration_that_is_of_another_lens_is_named(lens: Camera):
     assert 200 * found.focal_scale.value == pytest.approx(lens.fx, rel=0.12)  # some of it is distortion
 
 
+SIMULATED_FAULTS = pytest.mark.sweep(2, "faults of a simulated recording")
+SLIDER_FAULTS = pytest.mark.sweep(1, "faults of slider_depth")
+"""Of all faults together, some are drawn: each takes seconds."""
+
 READINGS = pytest.mark.parametrize(
     ("fault", "named"),
     [
@@ -134,6 +139,41 @@ def test_poses_of_another_convention_are_named(
     found = agreement(fault(shaken))
     assert [reading.words for reading in found.readings] == [named]
     assert f"read as {named}: events are then" in words(found)
+
+
+@pytest.mark.parametrize(
+    ("fault", "named", "mend"),
+    [
+        (lambda read: faults.exchanged(read, "size"), "x and y are exchanged", "exchange both columns"),
+        (lambda read: faults.exchanged(read, "all"), "x and y are exchanged", "exchange both columns"),
+        (
+            lambda read: faults.turned_events(read, lambda events, camera: (camera.width - 1 - events.x, events.y)),
+            "mirrored axes with x left, y down",
+            "write width - 1 - x for x",
+        ),
+        (
+            lambda read: faults.turned_events(read, lambda events, camera: (events.x, camera.height - 1 - events.y)),
+            "mirrored axes with x right, y up",
+            "write height - 1 - y for y",
+        ),
+        (
+            lambda read: faults.turned_events(faults.exchanged(read, "all"), lambda e, c: (c.width - 1 - e.x, e.y)),
+            "quarter of a turn (x up, y right)",
+            "write y for x, and width - 1 - x for y",
+        ),
+        (
+            lambda read: faults.turned_events(faults.exchanged(read, "all"), lambda e, c: (e.x, c.height - 1 - e.y)),
+            "quarter of a turn (x down, y left)",
+            "write height - 1 - y for x, and x for y",
+        ),
+    ],
+    ids=["sizes too", "all", "x", "y", "quarter", "other quarter"],
+)
+def test_exchanged_and_mirrored_axes_of_the_sensor_are_named(shaken: EventRecording, fault, named: str, mend: str):
+    found = agreement(fault(shaken))
+    assert len(found.readings) == 1 and named in found.readings[0].words
+    assert named in words(found) and f"if the poses are right, {found.readings[0].fault_of_events}." in words(found)
+    assert mend in words(found)
 
 
 def test_poses_of_a_body_are_reread_before_the_camera_is_mounted(shaken: EventRecording):
@@ -186,10 +226,10 @@ def test_a_simulated_recording_is_sound(simulated: EventRecording):
     assert found.corners.focal_scale.value == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
-def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
+def test_the_clock_of_the_poses_of_a_simulated_recording(simulated: EventRecording, late: int):
     found = agreement(faults.poses_late(simulated, late))
     assert found.pose_delay.value == pytest.approx(late, abs=0.5)
     assert f"the poses are stamped {abs(found.pose_delay.value):.1f} ms {'late' if late > 0 else 'early'}" in words(
@@ -197,12 +237,17 @@ def test_clocks_of_a_simulated_recording(simulated: EventRecording, late: int):
     )
     assert "to the times of the poses" in words(found) or "off the times of the poses" in words(found)
 
+
+@SIMULATED_FAULTS
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [10, -10])
+def test_the_clock_of_the_frames_of_a_simulated_recording(simulated: EventRecording, late: int):
     found = agreement(faults.frames_late(simulated, late))
     assert found.frame_delay is not None and found.frame_delay.value == pytest.approx(late, abs=1.0)
     assert "the times of the frames" in words(found)
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @READINGS
 def test_conventions_of_a_simulated_recording(
@@ -211,7 +256,7 @@ def test_conventions_of_a_simulated_recording(
     assert f"read as {named}: events are then" in words(agreement(fault(simulated)))
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.1, 0.3, 0.6, 0.8, 1.25, 1.7, 3.0])
 def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -220,7 +265,7 @@ def test_focal_length_of_a_simulated_recording(simulated: EventRecording, factor
     assert found.problems()[0].what.startswith("The focal length is wrong: ")
 
 
-@pytest.mark.sweep(1)
+@SIMULATED_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.5])
 def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRecording, factor: float):
@@ -234,38 +279,38 @@ def test_focal_length_of_the_frames_of_a_simulated_recording(simulated: EventRec
     assert "reprojection error of corners" in found.rows()["focal length by frames"]
 
 
-@pytest.fixture(scope="module")
-def slider(shared_data: Path) -> EventRecording:
-    return read_recording(shared_data / "slider_depth")
+@pytest.fixture
+def slider(slider_depth: Inspection) -> EventRecording:
+    return slider_depth.recording
 
 
 @pytest.mark.slow
-def test_slider_depth_is_sound(slider: EventRecording):
+def test_slider_depth_is_sound(slider_depth: Inspection):
     """Its events are some milliseconds later than its frames and, by its turning point, than its poses."""
-    found = agreement(slider)
-    assert found.problems() == []
+    found = slider_depth.agreement
+    assert found is not None and found.problems() == []
     assert found.frame_delay is not None and found.pose_delay.is_identifiable and found.frame_delay.is_identifiable
     assert found.pose_delay.value == pytest.approx(found.frame_delay.value, abs=3.0)
     assert "focal length is not identifiable" in found.verdict()
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [10, -10])
 @pytest.mark.parametrize("fault", [faults.poses_late, faults.frames_late])
 def test_clocks_of_slider_depth(
-    slider: EventRecording, fault: Callable[[EventRecording, int], EventRecording], late: int
+    slider_depth: Inspection, fault: Callable[[EventRecording, int], EventRecording], late: int
 ):
     """The clock of its poses is identifiable because the slider turns back at its end."""
-    sound, found = agreement(slider), agreement(fault(slider, late))
-    assert sound.frame_delay and found.frame_delay
+    sound, found = slider_depth.agreement, agreement(fault(slider_depth.recording, late))
+    assert sound and sound.frame_delay and found.frame_delay
     moved = found.pose_delay.value - sound.pose_delay.value, found.frame_delay.value - sound.frame_delay.value
     expected = (late, 0) if fault is faults.poses_late else (0, late)
     assert moved == pytest.approx(expected, abs=2.0)
     assert words(found).startswith("The clocks disagree by ")
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "named"),
@@ -284,7 +329,7 @@ def test_conventions_of_slider_depth(
     assert named in found and "this motion" in found
 
 
-@pytest.mark.sweep(1)
+@SLIDER_FAULTS
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.1, 1.7])
 def test_focal_length_of_slider_depth_is_not_identifiable(slider: EventRecording, factor: float):

@@ -299,9 +299,9 @@ def test_a_browser_flicks_between_right_and_wrong_times(tmp_path: Path, width: i
 
 
 @pytest.mark.slow
-def test_slider_depth_has_no_problems(shared_data: Path):
+def test_slider_depth_has_no_problems(slider_depth: Inspection):
     """Its authors state depths of 0.45 to 2.07 m."""
-    page = page_of(shared_data / "slider_depth")
+    page = Page(slider_depth.page())
     assert "No problems were found." in page.text
     names = [name for name, _ in page.images]
     assert sum(name.startswith("events on the frame at") for name in names) == 4 * 6

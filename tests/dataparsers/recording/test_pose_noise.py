@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.recording.pose_noise import pose_noise
+from enerf_ns.dataparsers.recording.pose_noise import pose_noise, smoothing_spline
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 
@@ -64,3 +65,14 @@ def test_a_mounted_camera_stays_mounted():
     assert noise is not None and noise.smooth.body is not None
     again = noise.smooth.body[0].of_mounted(mount)
     np.testing.assert_allclose(again.positions, noise.smooth.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
+@pytest.mark.parametrize("number", [5, 6, 20, 60])
+def test_smoothing_is_that_of_scipy(number: int, noise: float):
+    """At uneven knots, also in how smooth it chooses to be."""
+    random = np.random.default_rng(number)
+    places = np.cumsum(random.uniform(0.5, 1.5, number))
+    values = np.sin(9.0 * places / number) + noise * random.normal(size=number)
+    expected = make_smoothing_spline(places, values)(places)
+    np.testing.assert_allclose(smoothing_spline(places, values), expected, atol=1e-6)

@@ -209,7 +209,7 @@ def test_events_of_one_polarity_tell_nothing(tmp_path: Path):
     assert (on.value, off.value, on.error, off.error, is_measured) == (0.25, 0.25, math.inf, math.inf, False)
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.sweep(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "noise"),

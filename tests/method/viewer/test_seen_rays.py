@@ -49,3 +49,4 @@ def test_no_ray_loses_what_was_seen():
 def test_surfaces_may_lie_in_the_next_voxel():
     points = torch.tensor([[0.0, 0.0, 0.5], [0.25 + 0.5 * VOXEL, 0.0, 0.5], [0.25 + 1.5 * VOXEL, 0.0, 0.5], [0, 0, 2]])
     assert half_seen().may_be_surface(points).tolist() == [True, True, False, False]
+    assert half_seen().may_be_surface(points, beyond=True).tolist() == [True, True, False, True]

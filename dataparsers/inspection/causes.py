@@ -1,0 +1,81 @@
+"""Causes why events and poses do not fit together, for a training: the search of an inspection, or its quick part."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from enerf_ns.dataparsers.inspection.agreement import Agreement, is_in_focus
+from enerf_ns.dataparsers.inspection.problems import Problem
+from enerf_ns.dataparsers.recording.errors import RecordingError, quoted
+from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.scene.depth_range import UnknownDepthError, recording_parallax, scene_depth_range
+
+MIN_SHARE_IN_RANGE = 0.2
+"""Share of the measured depths within a depth range, below which the range is taken for a wrong one."""
+
+
+def depth_range_or_cause(
+    recording: EventRecording, stated: tuple[float, float] | None = None, as_read: EventRecording | None = None
+) -> tuple[float, float]:
+    """`scene_depth_range`, with an error that names the cause where poses, clock or calibration contradict the events.
+
+    Args:
+        recording, stated: The arguments of `scene_depth_range`.
+        as_read: Recording without corrections of poses and calibration, in which the cause is searched. Default: the
+            recording itself.
+
+    Raises:
+        FlagError: `stated` is no range.
+        RecordingError: The events do not show how deep the scene is.
+    """
+    try:
+        return scene_depth_range(recording, stated)
+    except UnknownDepthError as error:
+        found = _contradiction(as_read or recording, None)
+        if found is None:
+            raise
+        raise RecordingError(
+            f"{recording.path}: the depth range of the scene cannot be measured, because {in_a_clause(found)}; enerf "
+            f"inspect {quoted(recording.path)} shows this."
+        ) from error
+
+
+def why_not_explained(
+    recording: EventRecording, depth_range: tuple[float, float], as_read: EventRecording
+) -> str | None:
+    """The likely cause why a training cannot explain the events, as a clause with the advice; None if nothing is wrong.
+
+    Takes a second if nothing is wrong, and some seconds otherwise.
+
+    Args:
+        recording: The recording as it is trained on. Its index is made if it is not there yet.
+        depth_range: Nearest and farthest depth of the scene, metres.
+        as_read: The recording without corrections of poses and calibration, in which the cause is searched.
+    """
+    near, far = depth_range
+    if not is_in_focus(recording, math.sqrt(near * far)):
+        found = _contradiction(as_read, depth_range)
+        if found is not None:
+            return f"{in_a_clause(found)}; enerf inspect {quoted(recording.path)} shows this"
+    parallax = recording_parallax(recording)
+    if parallax.is_shown and np.mean((parallax.depths > near) & (parallax.depths < far)) < MIN_SHARE_IN_RANGE:
+        shown = "{:.3g} m to {:.3g} m".format(*parallax.depth_range)
+        return (
+            f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; leave out "
+            "--depth-range, or state it in the unit of the poses"
+        )
+    return None
+
+
+def _contradiction(recording: EventRecording, depth_range: tuple[float, float] | None) -> Problem | None:
+    """The gravest contradiction of poses, clock or focal length with the events; None if there is none."""
+    agreement = Agreement.of(recording, depth_range, with_frames=False)
+    return next(iter(agreement.problems() if agreement else ()), None)
+
+
+def in_a_clause(problem: Problem) -> str:
+    """A problem and its advice as clauses, which can follow "because"."""
+    what, (advice, *_) = problem.what.rstrip("."), problem.advice.rstrip(".").split(". ")
+    return f"{what[0].lower()}{what[1:]}; {advice[0].lower()}{advice[1:]}"

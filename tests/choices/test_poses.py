@@ -1,0 +1,46 @@
+"""Rows of the poses."""
+
+from __future__ import annotations
+
+import copy
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from enerf_ns.choices.poses import noise, selection
+from enerf_ns.choices.scene import Scene
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.method.config import enerf
+
+NOISE = 0.03
+"""Standard deviation of each coordinate of a position, metres."""
+
+
+@pytest.mark.parametrize(
+    ("by_flag", "stated", "distance"),
+    [((0.5, 8.0), None, 2.0), (None, (0.5, 8.0), 2.0), ((1.0, 16.0), (0.5, 8.0), 4.0), (None, None, 5.0)],
+)
+def test_noise_of_poses_moves_the_picture_by_what_it_is_at_the_distance_of_the_scene(
+    recording: Path, by_flag: tuple[float, float] | None, stated: tuple[float, float] | None, distance: float
+):
+    """The scene is in the geometric middle of its range of depth; where nobody states one, as far away as the camera
+    goes, which is 3 m to the right and 4 m down here."""
+    simulated = read_recording(recording)
+    start, end = simulated.trajectory.times[[0, -1]]
+    times = np.linspace(start, end, 401).astype(np.int64)
+    way = np.linspace(0.0, 1.0, 401)[:, None] * [3.0, 4.0, 0.0]
+    positions = way + NOISE * np.random.default_rng(0).normal(size=(401, 3))
+    noisy = Trajectory(times, positions, np.tile([0.0, 0.0, 0.0, 1.0], (401, 1)))
+    config: Any = copy.deepcopy(enerf.config.pipeline)
+    config.datamanager.dataparser.depth_range = by_flag
+    scene = Scene(config, replace(simulated, trajectory=noisy, depth_range=stated), None)
+    selection(scene)
+    noise(scene)
+    (row,) = scene.choices
+    (pixels,) = re.findall(r"^it moves the picture by ([\d.]+) pixels$", row.why)
+    assert row.kept and float(pixels) == pytest.approx(simulated.camera.fx * NOISE / distance, rel=0.1)
