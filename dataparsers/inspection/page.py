@@ -45,6 +45,7 @@ from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, percent
 from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
 from enerf_ns.dataparsers.scene.depth_range import UnknownDepthError, scene_depth_range, share_beyond
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ NUM_INSTANTS = 6
 """Number of instants at which events are shown, each beside the frame of the same time."""
 NUM_OVERLAYS = 4
 """Number of frames that edges of events are drawn on."""
+NUM_EDGE_VIEWS = 3
+"""Number of views in which the depth of edges is shown."""
 NUM_COMPENSATED = 3
 """Number of windows whose motion-compensated events are shown: with slow, usual and fast motion."""
 BLACK_PERCENTILE = 99.5
@@ -255,6 +258,7 @@ class Inspection:
             flick=self._flick(),
             overlays=self._overlays(),
             compensated=self._compensated(),
+            edge_depth=_plot(edges) if (edges := self.edge_depth()) else None,
             has_frames=self._frames is not None,
             corrections=_plot(corrections) if corrections else None,
             timeline=_plot(self.timeline()),
@@ -315,6 +319,40 @@ class Inspection:
         axis.set_xlabel("milliseconds from the stamp of a frame")
         axis.set_ylabel("event rate / median")
         axis.spines[["top", "right"]].set_visible(False)
+        return figure
+
+    def edge_depth(self) -> Figure | None:
+        """Figure of the depth of edges in some views, below the frames of about the same time. None if no edge has a
+        depth that several views confirm."""
+        from matplotlib.colors import LogNorm
+        from matplotlib.figure import Figure
+
+        views = [] if self.depth_range is None else edge_depth(self.recording, self.depth_range)
+        depths = np.concatenate([np.zeros(0), *(view.depth[view.depth > 0] for view in views)])
+        if not len(depths):
+            return None
+        near, far = np.percentile(depths, [1, 99])
+        known = [i for i, view in enumerate(views) if view.depth.any()]
+        shown = [views[known[i]] for i in np.unique(np.linspace(0, len(known) - 1, NUM_EDGE_VIEWS).round().astype(int))]
+        frames = self._frames
+        rows = 1 if frames is None else 2
+        ratio = shown[0].depth.shape[0] / shown[0].depth.shape[1]
+        figure = Figure(figsize=(11.4, 0.7 + rows * 3.7 * ratio), layout="constrained", dpi=150)
+        axes = figure.subplots(rows, len(shown), squeeze=False)
+        for view, column in zip(shown, axes.T, strict=True):
+            if frames is not None:
+                i = int(np.abs(frames.times - view.time).argmin())
+                column[0].imshow(in_8_bits(frames.camera.undistort(frames.image(i))), cmap="gray", vmin=0, vmax=255)
+                column[0].set_title(f"frame at {_seconds(frames.times[i])}", fontsize=9)
+            picture = np.ma.masked_equal(view.depth, 0)
+            drawn = column[-1].imshow(picture, "turbo_r", norm=LogNorm(near, max(far, 1.001 * near)))
+            column[-1].set_title(f"depth of edges at {_seconds(view.time)}", fontsize=9)
+        for axis in axes.flat:
+            axis.set(xticks=[], yticks=[])
+        bar = figure.colorbar(drawn, ax=axes, label="metres", shrink=0.8)
+        ticks = np.geomspace(near, far, 4)
+        bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks], minor=False)
+        bar.minorticks_off()
         return figure
 
     def trajectory(self) -> Figure:

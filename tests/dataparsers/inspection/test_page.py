@@ -23,6 +23,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 from stripes import recording_of_stripes
 
+from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, recording_of_points, shaking
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.event_index import event_picture
 from enerf_ns.dataparsers.index.indexing import index_events
@@ -31,6 +32,7 @@ from enerf_ns.dataparsers.inspection.problems import find_problems
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
 
@@ -220,6 +222,24 @@ def two_cameras(frame_trajectory: Trajectory, trajectory: Trajectory, frame: Pat
     return EventRecording(
         Path("memory"), "test", camera, trajectory, lambda: iter([events]), (), frames=frames, depth_range=(1.0, 3.0)
     )
+
+
+@pytest.mark.parametrize("amplitude", [0.2, 0.0])
+def test_the_depth_of_edges_is_drawn_where_a_camera_moves(amplitude: float):
+    events, trajectory, _ = recording_of_points(points_between(1.0, 3.0), shaking(amplitude), TURNING)
+    recording = EventRecording(
+        Path("memory"), "test", CAMERA, trajectory, lambda: iter([events]), (), depth_range=(0.7, 4.0)
+    )
+    figure = Inspection.of(recording).edge_depth()
+    if not amplitude:
+        assert figure is None
+        return
+    assert figure is not None
+    views = [view for view in edge_depth(recording, (0.7, 4.0)) if view.depth.any()]
+    drawn = [np.ma.asanyarray(axis.images[0].get_array()) for axis in figure.axes if axis.images]
+    assert len(drawn) == 3
+    for picture, view in zip(drawn, (views[0], views[round((len(views) - 1) / 2)], views[-1]), strict=True):
+        np.testing.assert_array_equal(picture.filled(0), view.depth)
 
 
 def path_drawn(inspection: Inspection) -> np.ndarray:
