@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import convolve1d, uniform_filter
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, recording_of_points, shaking
@@ -30,7 +30,7 @@ def relative_errors(view: EdgeView, points: np.ndarray) -> np.ndarray:
     seen = seen[seen[:, 2] > 0.05]
     places = view.focal_length * seen[:, :2] / seen[:, 2:] + np.array(view.principal_point)
     rows, columns = np.nonzero(view.depth)
-    near = cKDTree(places).query_ball_point(np.stack([columns, rows], axis=1), 2.0)
+    near = KDTree(places).query_ball_point(np.stack([columns, rows], axis=1), 2.0)
     found = view.depth[rows, columns]
     return np.array([min((abs(d / z - 1) for z in seen[i, 2]), default=1.0) for d, i in zip(found, near, strict=True)])
 
@@ -42,7 +42,7 @@ def test_edges_lie_where_the_points_are(unit: float):
     errors = np.concatenate([relative_errors(view, unit * points) for view in views])
     assert len(views) == 12 and len(errors) > 12 * len(points)
     assert np.median(errors) < 0.015 and np.mean(errors > 0.05) < 0.05
-    nearest = cKDTree(np.concatenate([view.points for view in views])).query(unit * points)[0]
+    nearest = KDTree(np.concatenate([view.points for view in views])).query(unit * points)[0]
     assert np.mean(nearest < 0.02 * unit) > 0.35  # points beside each other in different depths are left out
 
 
@@ -123,7 +123,9 @@ def test_depths_of_a_simulated_recording_are_right_within_a_hundredth(tmp_path: 
         seen = (view.points - pose[:, 3]) @ pose[:, :3]
         x, y = np.rint(seen[:, :2] / seen[:, 2:] * camera.fx + [camera.cx, camera.cy]).astype(int).T
         inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        around = np.pad(frames.depth(frame), 1, mode="edge")
+        depth = frames.depth(frame)
+        assert depth is not None
+        around = np.pad(depth, 1, mode="edge")
         true = np.stack([around[y[inside] + down, x[inside] + right] for down in range(3) for right in range(3)])
         errors.append(np.abs(seen[inside, 2] / true - 1).min(0))
         share.append(np.mean(view.depth > 0))
