@@ -245,7 +245,7 @@ class EnerfPipeline(VanillaPipeline):
         if sensor.threshold_map is None or sensor.refractory_period:
             return
         index = index_events(self.datamanager.recording)
-        on, off = (float(threshold) for threshold in sensor.contrast_thresholds)
+        on, off = (torch.as_tensor(threshold).item() for threshold in sensor.contrast_thresholds)
         noise = noise_per_event(index, (on, off)).value
         sensor.threshold_map.start_from(*threshold_differences(index, (on, off), noise))
 

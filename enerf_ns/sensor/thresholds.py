@@ -111,7 +111,7 @@ class Thresholds(SensorPart):
         """Values of the sensor that were learned: with `threshold_on` and `threshold_off`."""
         found = super().learned()
         if self.log_ratio is not None or self.log_mean is not None:
-            on, off = (float(torch.as_tensor(threshold)) for threshold in self.contrast_thresholds)
+            on, off = (torch.as_tensor(threshold).item() for threshold in self.contrast_thresholds)
             found |= {"threshold_on": on, "threshold_off": off}
         return found
 
