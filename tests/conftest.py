@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import random
 import shutil
+import signal
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,6 +93,14 @@ def warm_commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmComm
     commands = WarmCommands(tmp_path_factory.mktemp("printed"))
     yield commands
     commands.close()
+
+
+@pytest.fixture
+def python_interrupts() -> Iterator[None]:
+    """SIGINT interrupts, also where tests run in the background, whose processes ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 6
 
 
-@pytest.fixture(autouse=True)
-def interruptible() -> Iterator[None]:
-    """Also where these tests run in the background, whose processes ignore SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+pytestmark = pytest.mark.usefixtures("python_interrupts")
 
 
 def trained(config: EnerfTrainerConfig, first: int = 0, stop_after: int | None = None, by=signal.SIGTERM) -> Any:

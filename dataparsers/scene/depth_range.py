@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from rich import get_console
 from rich.progress import track
 
@@ -276,12 +276,18 @@ def grid_scale(camera: Camera) -> float:
 def _events_seen_within(radius: float, reference: int, events: Events, path_times, path) -> np.ndarray:
     """Numbers of the events around a time (ns) while the camera is within a radius (metres) of its place at that
     time."""
-    now = np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1)
-    outside = np.flatnonzero(np.linalg.norm(path - path[now], axis=1) > radius)
-    limits = np.concatenate([[0], outside, [len(path_times) - 1]])
-    after = np.searchsorted(limits, now)
-    first, last = np.searchsorted(events.t, path_times[limits[after - 1 : after + 1]])
+    now = int(np.clip(np.searchsorted(path_times, reference), 1, len(path_times) - 1))
+    ends = stretch_around(now, np.linalg.norm(path - path[now], axis=1) > radius)
+    first, last = np.searchsorted(events.t, path_times[ends])
     return np.arange(first, last)
+
+
+def stretch_around(now: int, is_outside: Bool[np.ndarray, " instants"]) -> list[int]:
+    """Numbers of the nearest instants before and after instant number `now`, at least 1, that are outside; or of the
+    first and the last instant."""
+    limits = np.concatenate([[0], np.flatnonzero(is_outside), [len(is_outside) - 1]])
+    after = np.searchsorted(limits, now)
+    return limits[after - 1 : after + 1].tolist()
 
 
 def rays_in_view(

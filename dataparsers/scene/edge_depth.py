@@ -14,7 +14,7 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
-from enerf_ns.dataparsers.scene.depth_range import grid_focal_length, grid_scale, rays_in_view
+from enerf_ns.dataparsers.scene.depth_range import grid_focal_length, grid_scale, rays_in_view, stretch_around
 
 NUM_VIEWS = 12
 """Number of reference views, spread evenly over the events."""
@@ -101,6 +101,9 @@ def edge_depth(
 
     Returns:
         The views in time order. There is none at an instant where the camera does not move, or without poses.
+
+    Raises:
+        RecordingError: The events cannot be used.
     """
     near, far = depth_range
     index, trajectory = index_events(recording), recording.trajectory
@@ -126,10 +129,7 @@ def _span_around(
     """First and last instant (ns) around a time while the camera stays within a radius (metres) of its place then."""
     now = int(np.clip(np.searchsorted(instants, time), 1, len(instants) - 2))
     left = (np.linalg.norm(path - path[now], axis=1) > radius) | apart | (2 * np.abs(instants - time) > longest)
-    outside = np.flatnonzero(left)
-    limits = np.concatenate([[0], outside, [len(instants) - 1]])
-    after = np.searchsorted(limits, now, "right")
-    return instants[limits[after - 1 : after + 1]]
+    return instants[stretch_around(now, left)]
 
 
 def _view_at(

@@ -87,11 +87,16 @@ class Reported:
         """A sentence for each score that some frames lack, with the reason. Without frames, none misses them."""
         reasons: dict[str, dict[str, list[int]]] = self.scores.get("not_scored", {})
         return [
-            f"No {name}" + (f" for frames {', '.join(map(str, numbers))}" if numbers else "") + f": {reason}."
+            f"No {name}{self._of_frames(numbers)}: {reason}."
             for name, by_reason in reasons.items()
             for reason, numbers in by_reason.items()
             if self.has_frames or not numbers
         ]
+
+    def _of_frames(self, numbers: Sequence[int]) -> str:
+        """Words on some held-out frames; empty for all of them."""
+        is_part = 0 < len(numbers) < self.num_frames
+        return f" for frames {', '.join(map(str, numbers))}" if is_part else ""
 
     def making(self) -> list[tuple[str, str]]:
         """Command, machine, data and assumptions of the run, by name, as far as its files state them."""

@@ -207,7 +207,7 @@ def test_runs_of_events_alone_open_neither_dark_nor_white(
 
 
 def test_who_is_there_before_the_scene_sees_training_to_its_end(
-    recording: Path, tmp_path: Path, pipeline: EnerfPipeline
+    recording: Path, tmp_path: Path, pipeline: EnerfPipeline, python_interrupts: None
 ):
     """Pictures come, and the step advances, also where no view moves. Whoever ends the viewer of a run that is done has
     a run that is done. Camera paths are not kept with the recording."""
@@ -396,6 +396,7 @@ def test_a_browser_sees_training_from_before_its_first_step_and_the_run_afterwar
          "--max-num-iterations", "200", "--evaluation-share", "0", "--machine.device-type", "cpu",
          "--viewer.websocket-port", str(port)],
         stdin=theirs, stdout=theirs, stderr=theirs,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests may run where it is ignored
     )  # fmt: skip
     printed: list[bytes] = []
     threading.Thread(target=keep, args=(ours, printed), daemon=True).start()
