@@ -4,29 +4,36 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.json_values import open_json
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
-from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import partial_of, write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.time_units import Times, check_units
 
+Finish = Callable[[Path], list[str]]
+"""Function that is called with a folder that was written, before it gets its name, and returns sentences about it."""
 
-def convert_recording(source: Path, output_dir: Path, **options: object) -> list[str]:
+
+def convert_recording(
+    source: Path, output_dir: Path, poses: GivenPoses | None = None, finish: Finish | None = None, **options: object
+) -> list[str]:
     """Copies all events, poses, frames and depth of a recording into a new folder of the layout event_recording.
 
     Args:
         source: Folder of a recording of any registered format; it is only read.
         output_dir: New or empty folder. After an error it is as before.
+        poses: Poses in place of those of the recording.
+        finish: Changes poses.txt in the new folder.
         options: Options of the format, by name.
 
     Returns:
@@ -38,7 +45,8 @@ def convert_recording(source: Path, output_dir: Path, **options: object) -> list
         OutputError: The folder holds something, lies in the recording, or cannot be written.
     """
     with new_folder(source, output_dir) as folder:
-        return write_recording(read_recording(source, **options), folder)  # type: ignore[arg-type]
+        sentences = write_recording(read_recording(source, poses=poses, **options), folder)  # type: ignore[arg-type]
+        return sentences + (finish(folder) if finish else [])
 
 
 def write_recording(recording: EventRecording, folder: Path) -> list[str]:
@@ -67,19 +75,18 @@ def write_recording(recording: EventRecording, folder: Path) -> list[str]:
 def convert_event_file(
     source: Path,
     output_dir: Path,
-    poses: Path | None = None,
-    poses_unit: Literal["s", "us", "ns"] = "s",
+    poses: GivenPoses | None = None,
     camera: Path | None = None,
+    finish: Finish | None = None,
 ) -> list[str]:
     """Writes the events of a file, with poses and camera if given, into a new folder of the layout event_recording.
 
     Args:
         source: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4; it is only read.
         output_dir: New or empty folder. After an error it is as before.
-        poses: Text file with lines t px py pz qx qy qz qw, on the clock of the event file; camera to world, OpenCV
-            axes, metres.
-        poses_unit: Unit of the times in the file of poses.
+        poses: Poses on the clock of the event file.
         camera: JSON file with width, height, model, fx, fy, cx, cy and distortion.
+        finish: Changes poses.txt in the new folder.
 
     Returns:
         Sentences that state what was written, and what must be added before training.
@@ -92,7 +99,7 @@ def convert_event_file(
     with new_folder(source, output_dir) as folder:
         file = open_event_file(source)
         about = _camera_json(file, camera)
-        rows = read_poses(poses, poses_unit, sentences) if poses is not None else None
+        rows = poses.rows({}, sentences) if poses is not None else None
         write_whole(folder / "recording.json", encode_json({"camera": about}))
         if rows is not None:
             event_recording.write_poses(folder / "poses.txt", rows[0] - file.start, *rows[1:])
@@ -102,13 +109,15 @@ def convert_event_file(
         if rows is not None and poses is not None:
             pixels = about["width"] * about["height"]
             events = Times.of_events(source, "us", num_events, last, pixels, is_certain=True)
-            check_units(source, [events, Times.of_rows("poses", poses, poses_unit, rows[0], "--poses-unit")])
-        if rows is not None and (rows[0][-1] < file.start or rows[0][0] > file.start + last):
+            check_units(source, [events, Times.of_rows("poses", poses.path, poses.unit, rows[0], "--poses-unit")])
+        if poses and rows and (rows[0][-1] < file.start or rows[0][0] > file.start + last):
             raise RecordingError(
-                f"{poses} holds poses from {rows[0][0] * 1e-9:.6f} s to {rows[0][-1] * 1e-9:.6f} s, but the events of "
-                f"{source} lie from {file.start * 1e-9:.6f} s to {(file.start + last) * 1e-9:.6f} s; give both on one "
-                "clock, and the unit of the poses as --poses-unit."
+                f"{poses.path} holds poses from {rows[0][0] * 1e-9:.6f} s to {rows[0][-1] * 1e-9:.6f} s, but the "
+                f"events of {source} lie from {file.start * 1e-9:.6f} s to {(file.start + last) * 1e-9:.6f} s; give "
+                "both on one clock, by --poses-delay-ms, and the unit of the poses as --poses-unit."
             )
+        if finish is not None:
+            sentences += finish(folder)
     sentences.append(
         f"{num_events:,} events of {last * 1e-9:.3f} s ({file.encoding}) are written; their time 0, that of the first "
         f"event, is {file.start} ns on the clock of the file."

@@ -19,6 +19,7 @@ import numpy as np
 
 from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -35,21 +36,25 @@ EVENT_COLUMNS = "t_s x y p"
 BYTES_AT_A_TIME = 2**22
 
 
-def read(folder: Path) -> EventRecording:
+def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     """Reads everything but the events, which are read when they are needed.
 
     The recording's zero of time is the earliest first stamp among events, frames and poses.
 
     Args:
         folder: The folder with the files that the module describes.
+        poses: Poses in place of groundtruth.txt.
 
     Raises:
         RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
     events_file = folder / "events.txt"
-    pose_times, positions, quaternions = read_poses(folder / "groundtruth.txt", "s", notes)
     frame_files, frame_times = _read_frame_list(folder, notes)
+    stamps = {file.name: time for file, time in zip(frame_files, frame_times.tolist(), strict=True)}
+    poses_file, unit = (folder / "groundtruth.txt", "s") if poses is None else (poses.path, poses.unit)
+    rows = read_poses(poses_file, unit, notes) if poses is None else poses.rows(stamps, notes)
+    pose_times, positions, quaternions = rows
     first_stamps = [_first_event_time(events_file), pose_times[0], *frame_times[:1]]
     zero = int(min(first_stamps))
     num_bytes = events_file.stat().st_size
@@ -70,7 +75,7 @@ def read(folder: Path) -> EventRecording:
         locate_event=lambda index: f"{events_file}, line {index + 1}",
         times_in={
             "events": (events_file, "s"),
-            "poses": (folder / "groundtruth.txt", "s"),
+            "poses": (poses_file, unit),
             "frames": (folder / "images.txt", "s"),
         },
     )
@@ -239,4 +244,5 @@ FORMAT = Format(
     description="Events in the text format of the UZH event-camera dataset.",
     files=FILES,
     read=read,
+    takes_poses=True,
 )

@@ -32,8 +32,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_columns, check_times
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.frame_folders import read_frames
+from enerf_ns.dataparsers.formats.frame_folders import read_frames, read_stamps
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.text_tables import read_poses
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
@@ -68,17 +69,18 @@ OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
     *("reconstructed_by", "white_level"),
 )
-EXPOSURES_NAME = "exposures_ns.txt"
+STAMPS_NAME, EXPOSURES_NAME = "stamps_ns.txt", "exposures_ns.txt"
 
 MOUNTING_TOLERANCE = 1e-6
 """Largest motion of the frame camera in the axes of the event camera: metres, and entries of the rotation."""
 
 
-def read(folder: Path) -> EventRecording:
+def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     """Reads everything but the events, which are read when they are needed.
 
     Args:
         folder: The folder with the files that the module describes.
+        poses: Poses in place of poses.txt.
 
     Raises:
         RecordingError: A file is missing, empty or cannot be used.
@@ -89,7 +91,9 @@ def read(folder: Path) -> EventRecording:
     about = open_json(path)
     about.check_keys(("camera",), OPTIONAL_KEYS)
     camera = parse_camera(about["camera"], folder / "camera_directions.npy")
-    trajectory = Trajectory(*read_poses(folder / "poses.txt", "ns", notes))
+    poses_file, unit = (folder / "poses.txt", "ns") if poses is None else (poses.path, poses.unit)
+    rows = read_poses(poses_file, unit, notes) if poses is None else poses.rows(_frame_times(folder), notes)
+    trajectory = Trajectory(*rows)
     frame_camera, frame_trajectory = camera, trajectory
     if (mounted := about.get("frame_camera")) is not None:
         frame_camera, mounting = _parse_frame_camera(mounted)
@@ -110,8 +114,8 @@ def read(folder: Path) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _stream_events(folder / "events", columns),
             event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
-            frames=_read_frames(folder / "frames", frame_camera, frame_trajectory, white, depth_files),
-            blurred_frames=_read_frames(folder / "blurred_frames", *blurred_rig, white),
+            frames=_read_frames(folder / "frames", poses_file, frame_camera, frame_trajectory, white, depth_files),
+            blurred_frames=_read_frames(folder / "blurred_frames", poses_file, *blurred_rig, white),
             reconstructed_by=reconstructed_by,
             contrast_thresholds=about.pair("contrast_thresholds", "two numbers above 0, of on and off events, were"),
             depth_range=about.pair("depth_range", "the nearest and the farthest depth in metres were"),
@@ -122,7 +126,7 @@ def read(folder: Path) -> EventRecording:
             num_events=len(columns["t"]),
             times_in={
                 "events": (folder / "events/t.npy", "ns"),
-                "poses": (folder / "poses.txt", "ns"),
+                "poses": (poses_file, unit),
                 "frames": (folder / "frames/stamps_ns.txt", "ns"),
                 "blurred frames": (folder / "blurred_frames/stamps_ns.txt", "ns"),
             },
@@ -374,14 +378,33 @@ def _frame_camera_json(recording: EventRecording, frames: Frames) -> dict[str, A
 
 
 def _read_frames(
-    folder: Path, camera: Camera, trajectory: Trajectory, white: float | None, depth_files: Sequence[Path] = ()
+    folder: Path,
+    poses_file: Path,
+    camera: Camera,
+    trajectory: Trajectory,
+    white: float | None,
+    depth_files: Sequence[Path] = (),
 ) -> Frames | None:
-    kinds = Image.registered_extensions()
-    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
-    stamps_file, exposures_file = folder / "stamps_ns.txt", folder / EXPOSURES_NAME
-    poses_file = folder.parent / "poses.txt"
-    frames = read_frames(files, stamps_file, camera, trajectory, depth_files, exposures_file, poses_file=poses_file)
+    stamps_file, exposures_file = folder / STAMPS_NAME, folder / EXPOSURES_NAME
+    rig = _images_in(folder), stamps_file, camera, trajectory
+    frames = read_frames(*rig, depth_files, exposures_file, poses_file=poses_file)
     return frames and replace(frames, stated_white=white)
+
+
+def _images_in(folder: Path) -> list[Path]:
+    kinds = Image.registered_extensions()
+    return sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
+
+
+def _frame_times(folder: Path) -> dict[str, int]:
+    """Returns the time (ns) of each frame by the name of its file."""
+    times: dict[str, int] = {}
+    for frames in (folder / "blurred_frames", folder / "frames"):
+        if (frames / STAMPS_NAME).exists():
+            files = _images_in(frames)
+            stamps = read_stamps(files, frames / STAMPS_NAME, "ns", frames).tolist()
+            times.update(zip((file.name for file in files), stamps, strict=True))
+    return times
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
@@ -479,5 +502,6 @@ FORMAT = Format(
     description="Events in the folder layout of enerf-ns, from any camera.",
     files=FILES,
     read=read,
+    takes_poses=True,
     writer=EventRecordingWriter,
 )

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, of_file
@@ -65,6 +66,7 @@ def read_recording(
     keep_pose_gaps: bool = False,
     undistort: bool = True,
     smooth_poses: bool = False,
+    poses: GivenPoses | None = None,
     **options: object,
 ) -> EventRecording:
     """Reads a recording without its events, which are read when they are needed. A process reads each folder once.
@@ -74,13 +76,14 @@ def read_recording(
         format: Name of a registered format, or "auto" to detect it.
         time_range: Argument of `EventRecording.selected`.
         keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses: Arguments of `EventRecording.selected`.
+        poses: Poses in place of those in the folder, which may then be missing. Default: those in the folder.
         options: Options of the format, by name.
 
     Raises:
         RecordingError: The folder has no known format, or its content cannot be used.
-        FlagError: There is no such format, it lacks an option, or the time range cannot be used.
+        FlagError: There is no such format, it lacks an option or takes no poses, or the time range cannot be used.
     """
-    found = _read_folder(absolute(path), format, **options)
+    found = _read_folder(absolute(path), format, poses, **options)
     return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses)
 
 
@@ -121,13 +124,21 @@ for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
 
 
 @cache
-def _read_folder(path: Path, format: str, **options: object) -> EventRecording:
+def _read_folder(path: Path, format: str, poses: GivenPoses | None, **options: object) -> EventRecording:
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give the folder of a recording.")
     if not path.is_dir():
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
     found = _find_format(path) if format == "auto" else format_named(format)
     _check_options(path, found, options)
+    if poses is not None:
+        if not found.takes_poses:
+            whose = ", ".join(format.name for format in formats() if format.takes_poses)
+            raise FlagError(
+                f"--poses is for event files and recordings of {whose}, but {path} is read as {found.name}, with its "
+                "own poses; convert it without --poses, and give --poses with the new recording."
+            )
+        options["poses"] = poses
     with of_file(path):
         return found.read(path, **options)
 

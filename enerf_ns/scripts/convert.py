@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
@@ -28,10 +29,9 @@ class Convert:
     """Folder or config.yml of a run that was trained on the recording. The new recording has the poses, clocks and
     lens parameters that this run refined. Default: the recording's own."""
     poses: Path | None = None
-    """For an event file: text file of poses, camera to world in OpenCV axes, one line t px py pz qx qy qz qw each. The
-    times are on the clock of the event file."""
-    poses_unit: Literal["s", "us", "ns"] = "s"
-    """Unit of the times in the file of --poses."""
+    """Poses of the event camera, on the clock of its events: text (TUM), CSV (EuRoC), the folder of a sparse model of
+    COLMAP, transforms.json of Nerfstudio, or a ROS bag. Default: those of the recording; an event file has none."""
+    pose_flags: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
     camera: Path | None = None
     """For an event file: JSON file of the camera with width, height, model, fx, fy, cx, cy and distortion."""
 
@@ -39,29 +39,43 @@ class Convert:
         source, output_dir = absolute(self.source), absolute(self.output_dir)
         if not source.exists():
             raise RecordingError(f"{source} does not exist; give the folder of a recording or an event file.")
-        chosen = self.options.given()
+        chosen, poses = self.options.given(), self._given_poses()
         if source.is_file():
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"
                 raise FlagError(f"{flag} is for folders of recordings, but {source} is a file; leave it out.")
             if self.run is not None:
                 raise FlagError(f"--run is for folders of recordings, but {source} is a file; leave it out.")
-            poses, camera = (path and expanded(path) for path in (self.poses, self.camera))
-            sentences = convert_event_file(source, output_dir, poses, self.poses_unit, camera)
+            sentences = convert_event_file(source, output_dir, poses, self.camera and expanded(self.camera))
         else:
-            for flag, value in (("--poses", self.poses), ("--camera", self.camera)):
-                if value is not None:
-                    raise FlagError(f"{flag} is for event files, but {source} is a folder with its own; leave it out.")
+            if self.camera is not None:
+                raise FlagError(f"--camera is for event files, but {source} is a folder with its own; leave it out.")
             if self.run is None:
-                sentences = convert_recording(source, output_dir, **chosen)
+                sentences = convert_recording(source, output_dir, poses, **chosen)
             else:
-                refuse_beside_run(chosen)
+                refuse_beside_run([*chosen, *(["poses"] if self.poses else [])])
                 sentences = self._convert_refined(self.run, source, output_dir)
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
         if source.is_dir() or (self.poses is not None and self.camera is not None):
             print_next(output_dir)
+
+    def _given_poses(self) -> GivenPoses | None:
+        """The poses that the user gave.
+
+        Raises:
+            FlagError: A flag for poses is given without them.
+        """
+        given = {option.name: getattr(self.pose_flags, option.name) for option in fields(PoseFlags)}
+        paths = {name: expanded(value) for name, value in given.items() if isinstance(value, Path)}
+        if self.poses is not None:
+            return GivenPoses(expanded(self.poses), replace(self.pose_flags, **paths))
+        for option in fields(PoseFlags):
+            if given[option.name] != option.default:
+                flag = f"--{option.name.replace('_', '-')}"
+                raise FlagError(f"{flag} is for poses of --poses, which is not given; give both, or leave it out.")
+        return None
 
     def _convert_refined(self, run: Path, source: Path, output_dir: Path) -> list[str]:
         """Writes the recording with the poses that a run refined, and returns sentences about it."""

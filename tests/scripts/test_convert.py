@@ -19,6 +19,7 @@ from test_event_files import BAD, FORMATS, events
 from test_event_recording import CAMERA, all_events, copied, same_recording, write_recording
 
 from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.formats.pose_files import PoseFlags
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError, UserError
@@ -136,7 +137,7 @@ def test_an_event_file_with_poses_and_calibration(
         evt2_file,
         tmp_path / "new",
         poses=tmp_path / "poses.txt",
-        poses_unit=unit,  # type: ignore[arg-type]
+        pose_flags=PoseFlags(poses_unit=unit),  # type: ignore[arg-type]
         camera=tmp_path / "camera.json",
     ).main()
     recording = read_recording(tmp_path / "new")
