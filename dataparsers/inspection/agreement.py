@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -606,7 +607,7 @@ def _top(values: np.ndarray, heights: np.ndarray, reach: float) -> float:
 
 
 def _best_readings(trajectory: Trajectory, heights: dict[Reading, float]) -> tuple[list[Reading], bool]:
-    """The readings that make events sharpest, the likeliest first, and whether they are clearly sharper than others.
+    """The readings that make events sharpest, the likeliest first, and whether some are clearly sharper than all others.
 
     Args:
         trajectory: As it was read.
@@ -618,7 +619,9 @@ def _best_readings(trajectory: Trajectory, heights: dict[Reading, float]) -> tup
     if best <= CLEARLY * heights[AS_READ]:
         best = heights[AS_READ]
     sharpest = [reading for reading in plausible if heights[reading] > ALIKE * best]
-    return sharpest, best > CLEARLY * max((heights[other] for other in plausible if other not in sharpest), default=0.0)
+    ordered = sorted((heights[reading] for reading in plausible), reverse=True)
+    some = pairwise(ordered[: len(ordered) // 2 + 1])  # a slide makes up to five readings about as sharp
+    return sharpest, any(sharper > CLEARLY * other for sharper, other in some)
 
 
 def _either(readings: list[Reading]) -> str:
