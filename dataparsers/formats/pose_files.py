@@ -43,7 +43,7 @@ FROM_OPENCV: dict[Axes, Float64[np.ndarray, "3 3"]] = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
-"""Rotation from OpenCV's axes of the camera to others, which is multiplied from the right."""
+"""Rotation from OpenCV's axes of the camera to others. Multiplied from the right, it makes poses of others OpenCV's."""
 
 PoseRows = tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]
 """Times (ns), positions and quaternions xyzw of poses."""

@@ -15,6 +15,7 @@ from enerf_ns.dataparsers.inspection.focus import (
     AS_STATED,
     INVERSE,
     READINGS,
+    ROS,
     SCALAR_FIRST,
     SCALAR_LAST,
     EventFocus,
@@ -203,7 +204,7 @@ def is_in_focus(recording: EventRecording, distance: float) -> bool:
     if not trials.focus.windows:
         return True
     heights = {one: float(trials.curve([Hypothesis(reading=one)]).sum()) for one in (AS_READ, *READINGS)}
-    readings, is_clear = _best_readings(recording.trajectory, heights)
+    readings, is_clear = _best_readings(recording.trajectory, heights, trials.focus.turn < SMALLEST_TURN)
     if not is_clear or AS_READ not in readings:
         return False
     focus, delays = trials.focus, [delay * MILLISECOND for delay in SHOWN_DELAYS]
@@ -393,7 +394,8 @@ class Agreement:
             return "This motion does not show which of these readings is right" + (f"; {fault}" if fault else "")
         if likeliest.exchanges:
             return fault[0].upper() + fault[1:]
-        return f"{_mend(likeliest)} in their file" + (f"; or, {fault}" if fault else "")
+        flag = likeliest.flag and f", or give {likeliest.flag} with --poses to enerf convert"
+        return f"{_mend(likeliest)} in their file{flag}" + (f"; or, {fault}" if fault else "")
 
     def _clock_problems(self) -> Iterator[Problem]:
         late = self._lateness()
@@ -487,7 +489,7 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
             reading: float(trials.curve([replace(one, reading=reading) for one in tried_for_all]).sum(1).max())
             for reading in (AS_READ, *READINGS)
         }
-        readings, is_clear = _best_readings(recording.trajectory, heights)
+        readings, is_clear = _best_readings(recording.trajectory, heights, trials.focus.turn < SMALLEST_TURN)
         lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
         if found is None or is_clear:
             found = trials, readings, is_clear, lens
@@ -606,12 +608,14 @@ def _top(values: np.ndarray, heights: np.ndarray, reach: float) -> float:
     return float(highest + np.clip(-linear / (2 * square), -reach, reach)) if square < 0 else float(highest)
 
 
-def _best_readings(trajectory: Trajectory, heights: dict[Reading, float]) -> tuple[list[Reading], bool]:
-    """The readings that make events sharpest, the likeliest first, and whether some are clearly sharper than all others.
+def _best_readings(trajectory: Trajectory, heights: dict[Reading, float], slides: bool) -> tuple[list[Reading], bool]:
+    """The readings that make events sharpest, the likeliest first, and whether they are clearly sharper than others.
 
     Args:
         trajectory: As it was read.
         heights: Sharpness of each reading.
+        slides: Whether the camera hardly turns. Readings that turn or mirror the scene about the slide are then nearly
+            as sharp, and up to half of all readings need not be clearly less sharp.
     """
     level = np.all(np.abs(_quaternions(trajectory)[:, :3]) < 1e-6)  # another order would turn each pose by half a turn
     plausible = [reading for reading in heights if not (level and reading in (SCALAR_FIRST, SCALAR_LAST))]
@@ -619,9 +623,10 @@ def _best_readings(trajectory: Trajectory, heights: dict[Reading, float]) -> tup
     if best <= CLEARLY * heights[AS_READ]:
         best = heights[AS_READ]
     sharpest = [reading for reading in plausible if heights[reading] > ALIKE * best]
-    ordered = sorted((heights[reading] for reading in plausible), reverse=True)
-    some = pairwise(ordered[: len(ordered) // 2 + 1])  # a slide makes up to five readings about as sharp
-    return sharpest, any(sharper > CLEARLY * other for sharper, other in some)
+    ladder = sorted((heights[reading] for reading in plausible), reverse=True)
+    first, last = len(sharpest), max(len(sharpest), len(ladder) // 2 if slides else 0)
+    steps = list(pairwise([*ladder, 0.0]))[first - 1 : last]
+    return sharpest, any(sharper > CLEARLY * other for sharper, other in steps)
 
 
 def _either(readings: list[Reading]) -> str:
@@ -637,6 +642,8 @@ def _mend(reading: Reading) -> str:
         return "Move the first number of each quaternion behind the other three"
     if reading is SCALAR_LAST:
         return "Move the last number of each quaternion before the other three"
+    if reading is ROS:
+        return "Multiply the rotation matrix of each pose from the right by ((0, 0, 1), (-1, 0, 0), (0, -1, 0))"
     signs = f"diag({', '.join(f'{sign:g}' for sign in reading.signs)})"
     if np.prod(reading.signs) < 0:  # a rotation stays one only if an axis of the world is mirrored, too
         return f"Mirror each pose, R to M R M and t to M t with M = {signs},"

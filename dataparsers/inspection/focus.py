@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.formats.pose_files import FROM_OPENCV
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
@@ -73,6 +74,19 @@ class Reading:
     """Whether x and y of the sensor are exchanged, before the signs count."""
     fault_of_events: str = ""
     """Fault of the events that has the same effect, and what to do. It can follow "if the poses are right,"."""
+    flag: str = ""
+    """Flag of `enerf convert` that states this convention."""
+
+    @property
+    def axes(self) -> Float64[np.ndarray, "3 3"]:
+        """Axes of the camera, as columns, in the axes in which they were read."""
+        columns = np.diag(self.signs)
+        return columns[:, [1, 0, 2]] if self.exchanges else columns
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether the axes of the camera are no mirror image of those in which they were read."""
+        return bool(np.linalg.det(self.axes) > 0)
 
 
 def _inverse(trajectory: Trajectory) -> Trajectory:
@@ -84,6 +98,11 @@ def _reordered(order: tuple[int, int, int, int]) -> Callable[[Trajectory], Traje
     return lambda read: Trajectory(read.times, read.positions, read.quaternions[:, order])
 
 
+def _from_ros(trajectory: Trajectory) -> Trajectory:
+    turned = Rotation.from_quat(trajectory.quaternions) * Rotation.from_matrix(FROM_OPENCV["ros"])
+    return Trajectory(trajectory.times, trajectory.positions, turned.as_quat())
+
+
 def _axes(signs: tuple[float, float, float]) -> str:
     names = ("right", "left"), ("down", "up"), ("forward", "backward")
     x, y, z = (names[axis][sign < 0] for axis, sign in enumerate(signs))
@@ -91,9 +110,10 @@ def _axes(signs: tuple[float, float, float]) -> str:
 
 
 AS_READ = Reading("the convention in which they were read")
-OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1))
-INVERSE = Reading("world to camera, the inverse", _inverse)
-SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)))
+OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1), flag="--poses-axes opengl")
+ROS = Reading("ROS's axes of a body with x forward, y left, z up", _from_ros, flag="--poses-axes ros")
+INVERSE = Reading("world to camera, the inverse", _inverse, flag="--poses-direction world-to-camera")
+SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)), flag="--poses-quaternions wxyz")
 SCALAR_LAST = Reading("quaternions in the order x y z w", _reordered((3, 0, 1, 2)))
 EXCHANGED = Reading(
     "axes of a sensor whose x and y are exchanged (x down, y right)",
@@ -111,6 +131,7 @@ READINGS = (
     SCALAR_FIRST,
     SCALAR_LAST,
     OPENGL,
+    ROS,
     EXCHANGED,
     *(
         Reading(
@@ -267,9 +288,7 @@ class EventFocus:
         times = evenly_spaced(window.start, window.end, STEPS_OF_WINDOW)
         moments = np.append(times, window.instant) + hypothesis.delay
         poses = read.poses(torch.from_numpy(moments.clip(read.start, read.end))).numpy()
-        poses[:, :, :3] *= hypothesis.reading.signs
-        if hypothesis.reading.exchanges:
-            poses = poses[:, :, [1, 0, 2, 3]]
+        poses[:, :, :3] = poses[:, :, :3] @ hypothesis.reading.axes
         reach = float(np.linalg.norm(poses[:, :, 3] - poses[-1, :, 3], axis=1).max())
 
         moment = np.rint((events.t - window.start) * ((len(times) - 1) / (window.end - window.start))).astype(int)

@@ -10,6 +10,7 @@ import tyro
 
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags
+from enerf_ns.dataparsers.inspection.pose_search import mend_poses
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.recording.files import absolute, expanded
 from enerf_ns.scripts.format_options import format_flags, refuse_beside_run
@@ -32,6 +33,9 @@ class Convert:
     """Poses of the event camera, on the clock of its events: text (TUM), CSV (EuRoC), the folder of a sparse model of
     COLMAP, transforms.json of Nerfstudio, or a ROS bag. Default: those of the recording; an event file has none."""
     pose_flags: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
+    accept_found: bool = False
+    """Search other conventions and another clock of the poses with the events, as enerf inspect does, and write the
+    poses that fit."""
     camera: Path | None = None
     """For an event file: JSON file of the camera with width, height, model, fx, fy, cx, cy and distortion."""
 
@@ -40,20 +44,24 @@ class Convert:
         if not source.exists():
             raise RecordingError(f"{source} does not exist; give the folder of a recording or an event file.")
         chosen, poses = self.options.given(), self._given_poses()
+        finish = (lambda folder: mend_poses(folder, output_dir)) if self.accept_found else None
         if source.is_file():
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"
                 raise FlagError(f"{flag} is for folders of recordings, but {source} is a file; leave it out.")
             if self.run is not None:
                 raise FlagError(f"--run is for folders of recordings, but {source} is a file; leave it out.")
-            sentences = convert_event_file(source, output_dir, poses, self.camera and expanded(self.camera))
+            if self.accept_found and (self.poses is None or self.camera is None):
+                raise FlagError(f"--accept-found compares poses with {source}; give --poses and --camera, too.")
+            sentences = convert_event_file(source, output_dir, poses, self.camera and expanded(self.camera), finish)
         else:
             if self.camera is not None:
                 raise FlagError(f"--camera is for event files, but {source} is a folder with its own; leave it out.")
             if self.run is None:
-                sentences = convert_recording(source, output_dir, poses, **chosen)
+                sentences = convert_recording(source, output_dir, poses, finish, **chosen)
             else:
-                refuse_beside_run([*chosen, *(["poses"] if self.poses else [])])
+                others = {"poses": self.poses, "accept_found": self.accept_found}
+                refuse_beside_run([*chosen, *(name for name, value in others.items() if value)])
                 sentences = self._convert_refined(self.run, source, output_dir)
         for sentence in sentences:
             print(printable(sentence))

@@ -11,6 +11,7 @@ import cv2
 import faults
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaking
@@ -195,6 +196,18 @@ def test_a_steady_slide_identifies_neither_clock_nor_focal_length():
         "the clock of the poses and the focal length are not identifiable from this recording"
     )
     assert found.rows()["equally sharp"].startswith("OpenGL's camera axes")
+
+
+def test_a_slide_with_the_poses_of_structure_from_motion_agrees_with_its_events():
+    """Their world has any direction, and they tremble. Another order of the quaternions then turns them by half a turn
+    and a bit, which is nearly as sharp."""
+    recording = points_seen((PHASE / np.pi - 1) * [0.3, 0, 0], STILL)
+    read, world = recording.trajectory, Rotation.from_quat([0.0257, 0.0739, -0.0101, 0.9969])
+    knots = np.random.default_rng(0).normal(size=(20, 3)) * 1e-3
+    trembling = Rotation.from_rotvec(CubicSpline(np.linspace(0, 1, 20), knots)(np.linspace(0, 1, len(read.times))))
+    turned = Trajectory(read.times, world.apply(read.positions), (world * trembling).as_quat())
+    found = agreement(faults.with_poses(recording, turned))
+    assert found.is_clear and found.problems() == []
 
 
 def test_poses_of_another_recording_bring_nothing_into_focus(shaken: EventRecording):
