@@ -243,6 +243,8 @@ PLACES = ("~nosuchuser/place", "loop", "loop/place", "x" * 300, "file/place", "n
 
 SMALL = ("--width", "16", "--height", "12", "--duration", "0.02")
 
+CONVERT_POSES = ("convert", "recording", "--output-dir", "new", "--poses", "recording/groundtruth.txt")
+
 PATH_FLAGS: dict[str, tuple[str, ...]] = {
     "inspect": ("inspect", "PLACE"),
     "inspect --output": ("inspect", "recording", "--output", "PLACE"),
@@ -250,6 +252,7 @@ PATH_FLAGS: dict[str, tuple[str, ...]] = {
     "convert --output-dir": ("convert", "recording", "--output-dir", "PLACE"),
     "convert --poses": ("convert", "recording.raw", "--output-dir", "new", "--poses", "PLACE"),
     "convert --camera": ("convert", "recording.raw", "--output-dir", "new", "--camera", "PLACE"),
+    "convert --hand-eye": (*CONVERT_POSES, "--hand-eye", "PLACE"),
     "reconstruct": ("reconstruct", "PLACE", "--output-dir", "new"),
     "reconstruct --output-dir": ("reconstruct", "recording", "--output-dir", "PLACE"),
     "reconstruct --weights": ("reconstruct", "recording", "--output-dir", "new", "--weights", "PLACE"),
@@ -356,7 +359,10 @@ FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
             }.items()
             for value in values
         },
-        "convert --poses = poses": ("convert", "recording", "--output-dir", "new", "--poses", "file"),
+        "convert --poses-scale = 2": ("convert", "recording", "--output-dir", "new", "--poses-scale", "2"),
+        "convert --poses-topic = /pose": (*CONVERT_POSES, "--poses-topic", "/pose"),
+        "convert --poses-scale = nan": (*CONVERT_POSES, "--poses-scale", "nan"),
+        "convert --poses-delay-ms = inf": (*CONVERT_POSES, "--poses-delay-ms", "inf"),
         "convert --camera = camera": ("convert", "recording", "--output-dir", "new", "--camera", "file"),
         "inspect --event-camera = left": ("inspect", "recording", "--event-camera", "left"),
         "inspect --output = a folder": ("inspect", "recording", "--output", "."),

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import EVENTS, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis, write_esim
+from scipy.spatial.transform import Rotation
 from test_event_files import BAD, FORMATS, events
 from test_event_recording import CAMERA, all_events, copied, same_recording, write_recording
 
@@ -259,6 +260,17 @@ def test_flags_that_cannot_be_followed_are_refused(tmp_path: Path, evt2_file: Pa
     assert refused(tmp_path, Convert(evt2_file, new, right)).startswith("--event-camera is for folders")
 
 
+def test_flags_of_poses_that_cannot_be_followed_are_refused(tmp_path: Path, evt2_file: Path):
+    source, new = write_davis(tmp_path / "davis"), tmp_path / "new"
+    scaled = Convert(source, new, pose_flags=PoseFlags(poses_scale=2.0))
+    assert refused(tmp_path, scaled).startswith("--poses-scale is for poses of --poses, which is not given")
+    beside_run = Convert(source, new, run=tmp_path / "run", poses=source / "groundtruth.txt")
+    assert refused(tmp_path, beside_run) == "--poses is taken from the run of --run; leave it out."
+    beside_run = Convert(source, new, run=tmp_path / "run", accept_found=True)
+    assert refused(tmp_path, beside_run) == "--accept-found is taken from the run of --run; leave it out."
+    assert "give --poses and --camera, too" in refused(tmp_path, Convert(evt2_file, new, accept_found=True))
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full, the disk that is always full")
 @pytest.mark.parametrize("what", ["folder", "file"])
 def test_a_full_disk_leaves_nothing(tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch, evt2_file: Path):
@@ -331,3 +343,21 @@ def test_the_command_line(tmp_path: Path):
     write_davis(tmp_path / "davis")
     tyro.cli(Convert, args=[str(tmp_path / "davis"), "--output-dir", str(tmp_path / "new")]).main()
     np.testing.assert_array_equal(all_events(read_recording(tmp_path / "new"))[:, :3], EVENTS[:, :3])
+
+
+def test_poses_of_another_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """In another unit, scaled, turned by a mount, and on a later clock; too few events for the search."""
+    import tyro
+
+    source = write_davis(tmp_path / "davis")
+    body = "".join(f"{t / 1e6 + 20} {' '.join(map(repr, row))}\n" for t, row in zip(POSE_TIMES, poses(), strict=True))
+    (tmp_path / "poses.txt").write_text(body)
+    (tmp_path / "mount.txt").write_text("0 0 0.5 0 0 0 1")
+    flags = "--poses-unit ms --poses-scale 2 --poses-delay-ms 20 --accept-found --hand-eye".split()
+    arguments = [str(source), "--output-dir", str(tmp_path / "new"), "--poses", str(tmp_path / "poses.txt"), *flags]
+    tyro.cli(Convert, args=[*arguments, str(tmp_path / "mount.txt")]).main()
+    assert "too few for a search of the convention" in capsys.readouterr().out
+    found = read_recording(tmp_path / "new").trajectory
+    np.testing.assert_array_equal(found.times, POSE_TIMES)
+    forward = Rotation.from_quat(poses()[:, 3:]).apply([0, 0, 0.5])
+    np.testing.assert_allclose(found.positions, 2 * poses()[:, :3] + forward, atol=1e-12)
