@@ -89,6 +89,9 @@ small a depth, which wrong poses often show, windows are too short for that."""
 ALIKE = 0.97
 """Share of the best sharpness above which another reading of the poses is as likely as the best one."""
 
+LIKELY_READINGS = 4
+"""Number of readings of the poses with which the delay is searched anew if no reading is clearly the sharpest."""
+
 SHOWN_DELAYS = (-20, -5, 5, 20)
 """Delays of the poses (ms) whose sharpness is shown."""
 
@@ -489,7 +492,13 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
             reading: float(trials.curve([replace(one, reading=reading) for one in tried_for_all]).sum(1).max())
             for reading in (AS_READ, *READINGS)
         }
-        readings, is_clear = _best_readings(recording.trajectory, heights, trials.focus.turn < SMALLEST_TURN)
+        slides = trials.focus.turn < SMALLEST_TURN
+        readings, is_clear = _best_readings(recording.trajectory, heights, slides)
+        if not is_clear:  # the delay was searched with the poses as they were read
+            for reading in sorted(heights, key=heights.__getitem__, reverse=True)[:LIKELY_READINGS]:
+                delayed = Hypothesis(round(trials.delay(reading, 1.0).value * MILLISECOND), reading=reading)
+                heights[reading] = max(heights[reading], float(trials.curve([delayed]).sum()))
+            readings, is_clear = _best_readings(recording.trajectory, heights, slides)
         lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
         if found is None or is_clear:
             found = trials, readings, is_clear, lens
