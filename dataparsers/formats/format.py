@@ -32,9 +32,9 @@ class Format:
     """Patterns (glob) of files that distinguish this format from others."""
     read: Callable[..., EventRecording]
     """Function that reads a folder (Path) without its events, with the options by name; raises RecordingError."""
-    takes_poses: bool = False
-    """Whether `read` takes poses (`GivenPoses`, or None) in place of those in the folder, which may then be missing."""
     options: type[FormatOptions] = FormatOptions
     """Class of the options that `read` takes."""
     writer: type[Writer] | None = None
     """Class that writes such a folder; None if the format can only be read."""
+    takes_poses: bool = False
+    """Whether `read` takes poses (`GivenPoses`, or None) in place of those in the folder, which may then be missing."""

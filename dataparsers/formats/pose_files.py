@@ -143,6 +143,7 @@ class GivenPoses:
             rows, numbers = read_rows(self.flags.poses_times, f"t_{self.unit} name")
             times = parse_times(self.flags.poses_times, [row[0] for row in rows], numbers, self.unit, "frames")
             table = dict(zip((Path(row[1]).name for row in rows), times.tolist(), strict=True))
+        table = {Path(name).stem: time for name, time in table.items()} | dict(table)
         at = {i: table[Path(name).name] for i, name in enumerate(names) if Path(name).name in table}
         if len(at) < 2:
             raise RecordingError(

@@ -124,7 +124,7 @@ for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
 
 
 @cache
-def _read_folder(path: Path, format: str, poses: GivenPoses | None, **options: object) -> EventRecording:
+def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **options: object) -> EventRecording:
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give the folder of a recording.")
     if not path.is_dir():

@@ -611,7 +611,7 @@ def _estimate(
 def _top(values: np.ndarray, heights: np.ndarray, reach: float) -> float:
     highest = values[heights.argmax()]
     near = np.abs(values - highest) <= reach
-    if near.sum() < 3:
+    if near.sum() < 3 or heights.max() == 0:
         return float(highest)
     square, linear, _ = np.polyfit(values[near] - highest, heights[near] / heights.max(), 2)
     return float(highest + np.clip(-linear / (2 * square), -reach, reach)) if square < 0 else float(highest)

@@ -68,7 +68,7 @@ def same(found: tuple[np.ndarray, np.ndarray, list[str]], times: np.ndarray = TI
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_text_of_tum(tmp_path: Path, unit: str):
     (tmp_path / "poses.txt").write_text("# t px py pz qx qy qz qw\n" + lines(TIMES, rows_of(MATRICES), unit))
-    same(read(tmp_path / "poses.txt", **({} if unit == "s" else {"poses_unit": unit})))
+    same(read(tmp_path / "poses.txt", None, **({} if unit == "s" else {"poses_unit": unit})))
 
 
 @pytest.mark.parametrize(
@@ -114,10 +114,12 @@ def test_models_of_colmap_are_in_the_order_of_their_images(tmp_path: Path, kind:
     same(read(folder, dict(zip(NAMES, TIMES[np.argsort(order)].tolist(), strict=True))), TIMES, MATRICES[order])
 
 
-def test_transforms_of_nerfstudio(tmp_path: Path):
+@pytest.mark.parametrize("suffix", [".png", ""])
+def test_transforms_of_nerfstudio(tmp_path: Path, suffix: str):
+    """Some programs leave out the suffix of the images."""
     opengl = MATRICES @ np.diag([1.0, -1.0, -1.0, 1.0])
     frames = [
-        {"file_path": f"images/{name}", "transform_matrix": matrix.tolist()}
+        {"file_path": f"images/{name.removesuffix('.png')}{suffix}", "transform_matrix": matrix.tolist()}
         for name, matrix in zip(NAMES, opengl, strict=True)
     ]
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
