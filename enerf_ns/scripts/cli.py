@@ -23,7 +23,7 @@ COMMANDS = {
     "check-numerics": ("CheckNumerics", "check the numerical errors of extreme cases"),
     "convert": ("Convert", "write a recording or an event file in the format of this package"),
     "demo": ("Demo", "simulate, train, and report with a video, in five minutes"),
-    "export": ("Export", "write a mesh, a point cloud or the refined poses of a run"),
+    "export": ("Export", "write a mesh, points, splats or the refined poses of a run"),
     "fetch-lpips": ("FetchLpips", "download the weights that the score LPIPS needs"),
     "inspect": ("Inspect", "check a recording before training on it"),
     "reconstruct": ("Reconstruct", "reconstruct frames from the events of a recording"),

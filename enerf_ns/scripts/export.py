@@ -1,4 +1,4 @@
-"""`enerf export`: mesh, point cloud or refined poses of a run, in metres and in the axes of the recording."""
+"""`enerf export`: mesh, points, splats or refined poses of a run, in metres and in the axes of the recording."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from enerf_ns.dataparsers.recording.files import absolute, expanded, write_toget
 if TYPE_CHECKING:
     from enerf_ns.method.pipeline import EnerfPipeline
 
-SUFFIXES = (".ply", ".glb")
-POSE_SUFFIXES = (".txt",)
+SUFFIXES = {"mesh": (".ply", ".glb"), "pointcloud": (".ply", ".glb"), "splats": (".ply",), "poses": (".txt",)}
 
 
 @dataclass
 class Export:
-    """Write a mesh, a point cloud or the refined poses of a run, in metres and in the axes of the recording.
+    """Write a mesh, points, splats or the refined poses of a run, in metres and in the axes of the recording.
 
     Regions that no camera saw, or whose depth the events do not determine, stay empty. If the recording was simulated,
     or a reference is given, the mesh or cloud is compared with it, and the scores are written into a .json file.
@@ -32,13 +31,13 @@ class Export:
     file has one line t px py pz qx qy qz qw for each pose (TUM format). A .json file beside it holds the lens.
     """
 
-    what: Annotated[Literal["mesh", "pointcloud", "poses"], tyro.conf.Positional]
-    """Output: a mesh, a point cloud or poses."""
+    what: Annotated[Literal["mesh", "pointcloud", "splats", "poses"], tyro.conf.Positional]
+    """Output: a mesh, a point cloud, Gaussian splats at the points (for viewers of 3D Gaussian splatting) or poses."""
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run, or its config.yml."""
     output: Optional[Path] = None  # noqa: UP045
-    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .txt for poses. Default: mesh.ply, pointcloud.ply
-    or poses.txt in the folder of the run."""
+    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .ply for splats, .txt for poses. Default:
+    mesh.ply, pointcloud.ply, splats.ply or poses.txt in the folder of the run."""
     voxel: Optional[float] = None  # noqa: UP045
     """Side in metres of the voxels in which depth is averaged. Default: 1.5 pixels at the median known depth."""
     reference: Optional[Path] = None  # noqa: UP045
@@ -47,6 +46,7 @@ class Export:
 
     def main(self) -> None:
         from enerf_ns.export.scoring import simulated_scene, surface_scores
+        from enerf_ns.export.splats import encode_splats, splat_sizes
         from enerf_ns.export.surface import VOXEL_PIXELS, fused, pixel_size, points_of, surface_views
         from enerf_ns.method.runs import load
         from enerf_ns.report.run_files import read_run
@@ -55,7 +55,7 @@ class Export:
         if self.voxel is not None and not 0.0 < self.voxel < np.inf:
             raise FlagError(f"--voxel is {self.voxel:g}, but must be metres above 0.")
         files = read_run(self.run)
-        suffixes = POSE_SUFFIXES if self.what == "poses" else SUFFIXES
+        suffixes = SUFFIXES[self.what]
         output = absolute(self.output or files.config_file.parent / f"{self.what}{suffixes[0]}")
         if output.suffix not in suffixes:
             raise FlagError(f"--output {output} does not end with {' or '.join(suffixes)}; give a file that does.")
@@ -84,7 +84,10 @@ class Export:
                 f"{files.config_file.parent} shows no surface at voxels of {voxel:.3g} m; give another --voxel, or "
                 "train it longer."
             )
-        content = surface.export(file_type=output.suffix[1:])
+        if self.what == "splats":
+            content = encode_splats(surface, splat_sizes(surface.vertices, camera, views, voxel))
+        else:
+            content = surface.export(file_type=output.suffix[1:])
         assert isinstance(content, bytes)
         written, lines = {output.name: content}, []
         low, high = surface.bounds

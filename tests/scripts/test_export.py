@@ -30,7 +30,9 @@ def run(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(method_config("enerf", recording, tmp_path_factory.mktemp("runs"), SMALL)).config_file.parent
 
 
-@pytest.mark.parametrize(("what", "suffix"), [("mesh", "ply"), ("mesh", "glb"), ("pointcloud", "ply")])
+@pytest.mark.parametrize(
+    ("what", "suffix"), [("mesh", "ply"), ("mesh", "glb"), ("pointcloud", "ply"), ("splats", "ply")]
+)
 def test_what_is_written_is_read_by_trimesh_and_scored(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: Any, suffix: str
 ):
