@@ -55,6 +55,7 @@ from enerf_ns.dataparsers.recording.files import (
     check_is_folder,
     is_deep,
     load_array,
+    load_depth,
     load_image,
     of_file,
     write_whole,
@@ -381,6 +382,11 @@ def _read_frames(
     stamps_file, exposures_file = folder / "stamps_ns.txt", folder / EXPOSURES_NAME
     poses_file = folder.parent / "poses.txt"
     frames = read_frames(files, stamps_file, camera, trajectory, depth_files, exposures_file, poses_file=poses_file)
+    if frames and white not in (None, 255) and not is_deep(files[0]):
+        raise RecordingError(
+            f"{folder.parent / 'recording.json'} holds white_level = {white:g}, but {files[0]} has 8 bits, of which "
+            "255 is white; leave white_level out."
+        )
     return frames and replace(frames, stated_white=white)
 
 
@@ -398,6 +404,7 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
     if frames.depth_filenames and folder.name == "frames":
         depth_folder.mkdir()
         for name, source in zip(names, frames.depth_filenames, strict=True):
+            load_depth(source)  # raises RecordingError if it is no depth map
             shutil.copyfile(source, depth_folder / f"{name}.npy")
 
 
