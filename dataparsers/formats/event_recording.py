@@ -56,6 +56,7 @@ from enerf_ns.dataparsers.recording.files import (
     check_is_folder,
     is_deep,
     load_array,
+    load_depth,
     load_image,
     of_file,
     write_whole,
@@ -386,8 +387,14 @@ def _read_frames(
     depth_files: Sequence[Path] = (),
 ) -> Frames | None:
     stamps_file, exposures_file = folder / STAMPS_NAME, folder / EXPOSURES_NAME
-    rig = _images_in(folder), stamps_file, camera, trajectory
+    files = _images_in(folder)
+    rig = files, stamps_file, camera, trajectory
     frames = read_frames(*rig, depth_files, exposures_file, poses_file=poses_file)
+    if frames and white not in (None, 255) and not is_deep(files[0]):
+        raise RecordingError(
+            f"{folder.parent / 'recording.json'} holds white_level = {white:g}, but {files[0]} has 8 bits, of which "
+            "255 is white; leave white_level out."
+        )
     return frames and replace(frames, stated_white=white)
 
 
@@ -421,6 +428,7 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
     if frames.depth_filenames and folder.name == "frames":
         depth_folder.mkdir()
         for name, source in zip(names, frames.depth_filenames, strict=True):
+            load_depth(source)  # raises RecordingError if it is no depth map
             shutil.copyfile(source, depth_folder / f"{name}.npy")
 
 

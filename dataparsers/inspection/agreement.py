@@ -25,7 +25,7 @@ from enerf_ns.dataparsers.inspection.focus import (
 )
 from enerf_ns.dataparsers.inspection.frame_edges import FrameEdges
 from enerf_ns.dataparsers.inspection.frame_tracks import FrameTracks
-from enerf_ns.dataparsers.inspection.problems import Problem
+from enerf_ns.dataparsers.inspection.problems import OpenQuestion, Problem
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -97,6 +97,10 @@ SHOWN_DELAYS = (-20, -5, 5, 20)
 
 SHOWN_SCALES = (0.9, 1.1)
 """Multiples of the focal length whose sharpness is shown."""
+
+
+FITS = "whether poses, clocks and calibration fit the events"
+"""The question that the search answers."""
 
 
 @dataclass(frozen=True)
@@ -238,6 +242,28 @@ def _plane_and_frame_delay(edges: FrameEdges, largest: int) -> tuple[int, Estima
     return plane, replace(early, value=-early.value)
 
 
+def usual_depth(recording: EventRecording, depth_range: tuple[float, float] | None) -> float:
+    """The geometric mean of a depth range, metres; the extent of the camera's path if the range is unknown."""
+    near, far = depth_range or 2 * (float(np.linalg.norm(np.ptp(recording.trajectory.positions, axis=0))) or 1.0,)
+    return math.sqrt(near * far)
+
+
+def why_no_search(recording: EventRecording, depth_range: tuple[float, float] | None) -> OpenQuestion | None:
+    """The reason why events cannot be compared with poses and calibration; None if they can.
+
+    Args:
+        recording: Its index is made if it is not there yet.
+        depth_range: Nearest and farthest depth, metres, if known.
+    """
+    camera, focus = recording.camera, EventFocus(recording, usual_depth(recording, depth_range))
+    if focus.windows:
+        return None
+    why = "no part of the recording has enough events while the picture moves a little"
+    if focus.is_small:
+        why = f"a sensor of {camera.width} x {camera.height} pixels shows too little, or {why}"
+    return OpenQuestion(FITS, why)
+
+
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """The agreement of poses, clocks and focal length of a recording with its events."""
@@ -277,8 +303,9 @@ class Agreement:
         Returns:
             None if the events are too few, or the recording is too short.
         """
-        near, far = depth_range or 2 * (float(np.linalg.norm(np.ptp(recording.trajectory.positions, axis=0))) or 1.0,)
-        search = _search(recording, math.sqrt(near * far))
+        usual = usual_depth(recording, depth_range)
+        near, far = depth_range or (usual, usual)
+        search = _search(recording, usual)
         if search is None:
             return None
         trials, readings, is_clear, lens = search
@@ -303,16 +330,36 @@ class Agreement:
         """One sentence on whether poses, clocks and calibration agree with the events."""
         if found := self.problems():
             return found[0].what
-        delays = {"the clock of the poses": self.pose_delay, "the clock of the frames": self.frame_delay}
-        unknown = [what for what, delay in delays.items() if delay is not None and not delay.is_identifiable]
-        by_frames = self.corners is not None and self.corners.focal_scale.is_identifiable and self._is_one_camera
-        unknown += ["the focal length"] * (not self.focal_scale.is_identifiable and not by_frames)
+        if not self.is_clear:
+            return self.unknown()[0].sentence
+        unknown = self._unidentified
         apart = self.pixels(float(np.ptp([*self._lateness().values()])))
         verdict = f"poses, clocks and calibration agree with the events to {apart:.1f} pixels"
         if unknown:
             verb = "is" if len(unknown) == 1 else "are"
             verdict += f"; {' and '.join(unknown)} {verb} not identifiable from this recording"
         return verdict
+
+    @property
+    def _unidentified(self) -> list[str]:
+        """Names of the values that this recording does not identify."""
+        delays = {"the clock of the poses": self.pose_delay, "the clock of the frames": self.frame_delay}
+        unknown = [what for what, delay in delays.items() if delay is not None and not delay.is_identifiable]
+        by_frames = self.corners is not None and self.corners.focal_scale.is_identifiable and self._is_one_camera
+        return unknown + ["the focal length"] * (not self.focal_scale.is_identifiable and not by_frames)
+
+    def unknown(self) -> list[OpenQuestion]:
+        """Questions that the search leaves open. None if it found a problem."""
+        if self.problems():
+            return []
+        if not self.is_clear:
+            camera = self.focus.recording.camera
+            size = f"{camera.width} x {camera.height} pixels"
+            return [OpenQuestion(FITS, f"on {size}, other readings of the poses make the events about as sharp")]
+        others = [reading for reading in self.readings if reading is not AS_READ]
+        alike = [OpenQuestion("how the poses are to be read", f"{_either(others)} fit as well")] if others else []
+        why = "this recording does not identify it"
+        return alike + [OpenQuestion(f"whether {what} is right", why) for what in self._unidentified]
 
     def rows(self) -> dict[str, str]:
         """The measurements in words, by name."""
@@ -361,6 +408,8 @@ class Agreement:
         focal = list(self._focal_problems())
         if focal and not FOCAL_SCALES[0] <= self.focal_scale.value <= FOCAL_SCALES[-1]:
             return focal  # with the calibration of another lens, poses and clocks do not fit either
+        if not self.is_clear and self.focus.is_small:
+            return [*self._pose_problems()]
         if not self.is_clear:
             return [
                 Problem(
@@ -611,7 +660,7 @@ def _estimate(
 def _top(values: np.ndarray, heights: np.ndarray, reach: float) -> float:
     highest = values[heights.argmax()]
     near = np.abs(values - highest) <= reach
-    if near.sum() < 3 or heights.max() == 0:
+    if near.sum() < 3 or not heights.max():
         return float(highest)
     square, linear, _ = np.polyfit(values[near] - highest, heights[near] / heights.max(), 2)
     return float(highest + np.clip(-linear / (2 * square), -reach, reach)) if square < 0 else float(highest)

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from enerf_ns.dataparsers.inspection.agreement import Agreement, is_in_focus
 from enerf_ns.dataparsers.inspection.problems import Problem
 from enerf_ns.dataparsers.recording.errors import RecordingError, quoted
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.scene.depth_range import UnknownDepthError, recording_parallax, scene_depth_range
-
-MIN_SHARE_IN_RANGE = 0.2
-"""Share of the measured depths within a depth range, below which the range is taken for a wrong one."""
 
 
 def depth_range_or_cause(
@@ -60,7 +55,7 @@ def why_not_explained(
         if found is not None:
             return f"{in_a_clause(found)}; enerf inspect {quoted(recording.path)} shows this"
     parallax = recording_parallax(recording)
-    if parallax.is_shown and np.mean((parallax.depths > near) & (parallax.depths < far)) < MIN_SHARE_IN_RANGE:
+    if parallax.contradicts(depth_range):
         shown = "{:.3g} m to {:.3g} m".format(*parallax.depth_range)
         return (
             f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; leave out "

@@ -45,8 +45,12 @@ EVENTS_PER_PICTURE = 60_000
 FEWEST_EVENTS = 2_000
 """Fewest events of a window."""
 
-FEWEST_TILES = 12
+FEWEST_TILES = 4
 """Smallest sensor, in tiles."""
+
+TILES_OF_CHANCE = 12
+"""Smallest sensor, in tiles, on which right poses are always clearly sharper than others. On smaller ones, a few tiles
+can be as sharp by chance."""
 
 PLANES = np.arange(0.0, 65.0)
 """Planes of the sweep, as disparities: grid pixels by which a point on the plane moves while the camera moves through
@@ -219,7 +223,10 @@ class EventFocus:
         self.windows = []
         """Windows in time order. None if there are too few events or pixels."""
         camera = recording.camera
-        if camera.width * camera.height * grid_scale(camera) ** 2 >= FEWEST_TILES * TILE**2:
+        tiles = camera.width * camera.height * grid_scale(camera) ** 2 / TILE**2
+        self.is_small = tiles < TILES_OF_CHANCE
+        """Whether a few tiles of the sensor can be sharp by chance."""
+        if tiles >= FEWEST_TILES:
             start, end = _posed_span(recording)
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
         self._trajectories = {AS_READ: recording.trajectory}

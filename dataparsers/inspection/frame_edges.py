@@ -91,7 +91,7 @@ class FrameEdges:
         for column, number in enumerate(numbers):
             gradient = self._gradient(number)
             for row, time in enumerate((self.frames.times[number] + delays).tolist()):
-                found[row, column] = _correlation(gradient, _smooth(np.minimum(self._density(time, plane), 3)))
+                found[row, column] = correlation(gradient, _smooth(np.minimum(self._density(time, plane), 3)))
         return found
 
     def best_plane(self, delays: Int64[np.ndarray, " delays"]) -> int:
@@ -168,7 +168,8 @@ def _smooth(picture: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray,
     return cv2.GaussianBlur(picture, (0, 0), 0.7)
 
 
-def _correlation(one: np.ndarray, other: np.ndarray) -> float:
+def correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """The correlation of two arrays of one shape, from -1 to 1; 0 if one of them is constant."""
     one, other = one - one.mean(), other - other.mean()
     norm = float(np.sqrt((one**2).sum() * (other**2).sum()))
     return float((one * other).sum()) / norm if norm else 0.0

@@ -26,11 +26,14 @@ from enerf_ns.dataparsers.inspection.agreement import (
     SHOWN_DELAYS,
     Agreement,
     shown_hypotheses,
+    why_no_search,
 )
+from enerf_ns.dataparsers.inspection.evidence import Evidence
 from enerf_ns.dataparsers.inspection.focus import AS_READ, AS_STATED, Hypothesis
 from enerf_ns.dataparsers.inspection.frame_bursts import FrameBursts
 from enerf_ns.dataparsers.inspection.problems import (
     EventStatistics,
+    OpenQuestion,
     Problem,
     event_statistics,
     find_problems,
@@ -123,6 +126,8 @@ class Inspection:
     """Agreement of clocks, poses and focal length with the events. None if there are too few events."""
     as_stated: Agreement | None = None
     """The same with the clocks, poses and focal length as stated. None unless a training refined them."""
+    unknown: tuple[OpenQuestion, ...] = ()
+    """Questions that nothing in the recording answers."""
 
     @classmethod
     def of(cls, recording: EventRecording) -> Inspection:
@@ -139,14 +144,17 @@ class Inspection:
             unknown = [f"The depth range of the scene cannot be measured, because {error.reason}."]
         agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
         contradictions = agreement.problems() if agreement else []
-        problems = [*contradictions, *sensor.problems()]
+        evidence = Evidence.of(recording)
+        problems = [*contradictions, *evidence.problems, *sensor.problems()]
+        questions = agreement.unknown() if agreement else [why_no_search(recording, near_far)]
         mend = "State the range with --depth-range NEAR FAR of the data parser (metres), which training needs."
         if contradictions:
             mend = "Mend the first problem of this list. The wrong poses, clock or calibration can be the cause."
         problems += [*find_problems(recording, near_far, statistics), *(Problem(what, mend) for what in unknown)]
         as_read = recording.as_read
         as_stated = None if as_read is None else Agreement.of(as_read, near_far)
-        return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated)
+        open_questions = tuple(one for one in [*questions, *evidence.unknown] if one is not None)
+        return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated, open_questions)
 
     def print_tables(self, console: Console) -> None:
         """Prints all tables, notes in yellow and problems in red."""
@@ -159,7 +167,14 @@ class Inspection:
             console.print(table)
         for note in self.notes():
             console.print(Text(f"note: {printable(note)}", "yellow"))
-        console.print(problems_table(self.problems))
+        for one in self.unknown:
+            console.print(Text(printable(one.sentence), "yellow"))
+        console.print(problems_table(self.problems, self.no_problems))
+
+    @property
+    def no_problems(self) -> str:
+        """The verdict where no problems were found."""
+        return "No problems were found in what can be measured." if self.unknown else "No problems were found."
 
     def notes(self) -> list[str]:
         """Sentences on what was left out of the recording, mended or assumed."""
@@ -251,6 +266,8 @@ class Inspection:
             name=self.recording.path.name,
             path=self.recording.path,
             problems=self.problems,
+            unknown=self.unknown,
+            no_problems=self.no_problems,
             tables=self._tables(),
             notes=self.notes(),
             bursts=_plot(self.bursts(self.sensor.bursts)) if self.sensor.bursts else None,
@@ -509,10 +526,10 @@ class Inspection:
         return _picture(event_picture(index_events(self.recording), self.recording.camera, int(time)), "PNG")
 
 
-def problems_table(problems: list[Problem]) -> Table | str:
-    """Problems in red, each with advice, for the terminal."""
+def problems_table(problems: list[Problem], none: str) -> Table | str:
+    """Problems in red, each with advice, for the terminal; or the words for their absence, in green."""
     if not problems:
-        return "[green]No problems were found.[/green]"
+        return f"[green]{none}[/green]"
     table = Table(title=f"[red]Problems ({len(problems)})[/red]", title_justify="left", show_lines=True)
     table.add_column("problem", style="red", ratio=1)
     table.add_column("what to do", ratio=1)

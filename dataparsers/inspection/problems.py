@@ -113,6 +113,20 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class OpenQuestion:
+    """A question about a recording that nothing in it answers."""
+
+    question: str
+    """The question, which can follow "It is unknown"."""
+    why: str
+    """The reason, which can follow "because"."""
+
+    @property
+    def sentence(self) -> str:
+        return f"It is unknown {self.question}, because {self.why}."
+
+
+@dataclass(frozen=True)
 class EventStatistics:
     """Counts of a recording's events, without the hot pixels that are left out."""
 

@@ -17,6 +17,10 @@ ROUND_TRIP_TOLERANCE = 1e-6
 SHORTEST_FOCAL_LENGTH, LONGEST_FOCAL_LENGTH = 0.01, 1e4
 """Shortest and longest focal length, as a multiple of the width or height: views of 179 and of 0.006 degrees."""
 
+MOST_STRETCHED = 4
+"""Largest ratio of the two focal lengths. Anamorphic lenses stretch an image up to twofold, and so do sensors whose
+pixels are not square."""
+
 FARTHEST_PRINCIPAL_POINT = 10
 """Largest distance of the principal point from the middle of the image, as a multiple of the width or height."""
 
@@ -103,7 +107,7 @@ class Camera:
             and abs(principal_point - side / 2) < FARTHEST_PRINCIPAL_POINT * side
             for side, focal_length, principal_point in axes
         )
-        if not fits:
+        if not fits or max(self.fx, self.fy) > MOST_STRETCHED * min(self.fx, self.fy):
             raise ValueError(
                 f"a camera of {self.width} x {self.height} pixels with the focal lengths {self.fx:g} and {self.fy:g} "
                 f"and the principal point ({self.cx:g}, {self.cy:g}), which fits no lens; state all in pixels."

@@ -15,10 +15,16 @@ from typing import Any
 import cv2
 import numpy as np
 import psutil
-from jaxtyping import Float, Shaped, UInt8
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float, Float32, Shaped, UInt8
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, UserError
+
+OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
+"""Colour spaces of images that are not those of a camera's pixels."""
+
+UPRIGHT = 1
+"""EXIF orientation of an image that is shown as it is stored."""
 
 
 def expanded(path: Path | str) -> Path:
@@ -159,15 +165,18 @@ def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
     Transparent pixels are laid over white. For 16 bits and floats, `picture_depth` finds the value of full brightness.
 
     Raises:
-        RecordingError: The file is missing or cannot be decoded, or holds values of another type, below 0 or not
-            finite.
+        RecordingError: The file is missing or cannot be decoded, is shown turned or mirrored, is neither grey nor RGB,
+            holds several pictures, or holds values of another type, below 0 or not finite.
     """
     with reading(path, "an image"):
         if is_deep(path):
             return _load_deep(path)
         with Image.open(path) as image:
+            _check_is_plain(path, image)
             image.verify()  # the checksums of a PNG, which decoding passes over
         with Image.open(path) as image:
+            image.load()
+            _check_is_plain(path, image)  # once more, since a PNG may have its EXIF behind its pixels
             grey = image.mode in ("1", "L", "LA")
             if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info:
                 colours = image.convert("RGBA")
@@ -196,6 +205,7 @@ def is_deep(path: Path) -> bool:
 def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
     """Returns the values of an image with more than 8 bits in each channel, uint16 or float32, as `load_image` does."""
     with suppress(UnidentifiedImageError), Image.open(path) as image:
+        _check_is_plain(path, image)
         image.verify()
     stored = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None:
@@ -221,6 +231,24 @@ def _load_deep(path: Path) -> Shaped[np.ndarray, "height width channels"]:
     return np.ascontiguousarray(pixels[..., ::-1])
 
 
+def _check_is_plain(path: Path, image: Image.Image) -> None:
+    """Checks that an opened image is one picture, grey or RGB, with its pixels in the order of the sensor.
+
+    Raises:
+        RecordingError: It is animated, has several pages, is CMYK or LAB, or its EXIF states another orientation.
+    """
+    if (number := getattr(image, "n_frames", 1)) > 1:
+        raise RecordingError(f"{path} holds {number} pictures, but one was expected; write each into its own file.")
+    if image.mode in OTHER_COLOURS:
+        raise RecordingError(f"{path} holds colours in {image.mode}, but grey or RGB was expected; convert it to RGB.")
+    turn = Image.Image.getexif(image).get(ExifTags.Base.Orientation, UPRIGHT)  # of a PNG, without decoding it
+    if turn not in (0, UPRIGHT):
+        raise RecordingError(
+            f"{path} is to be shown turned or mirrored by its EXIF (orientation {turn}), but pixels in the order of "
+            "the sensor were expected; store them in this order, without this tag."
+        )
+
+
 def in_colour(image: UInt8[np.ndarray, "height width *channels"]) -> UInt8[np.ndarray, "height width 3"]:
     """Returns an image with three channels; a grey image, [height, width] or with one channel, is repeated."""
     image = image if image.ndim == 3 else image[..., None]
@@ -231,7 +259,7 @@ def check_image_sizes(paths: Sequence[Path], width: int, height: int) -> None:
     """Checks that images have this size in pixels, from their headers only.
 
     Raises:
-        RecordingError: A file is missing, is not an image, or has another size.
+        RecordingError: A file is missing, is not an image, or has another size; or `image_size` refuses it.
     """
     for path in paths:
         if (found := image_size(path)) != (width, height):
@@ -245,11 +273,13 @@ def image_size(path: Path) -> tuple[int, int]:
     """Returns width and height in pixels, from the header only.
 
     Raises:
-        RecordingError: The file is missing or is not an image.
+        RecordingError: The file is missing or is not an image, is shown turned or mirrored, is neither grey nor RGB, or
+            holds several pictures.
     """
     with reading(path, "an image"):
         try:
             with Image.open(path) as image:
+                _check_is_plain(path, image)
                 return image.size
         except UnidentifiedImageError:
             height, width, _ = _load_deep(path).shape
@@ -271,6 +301,22 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")
     return array
+
+
+def load_depth(path: Path) -> Float32[np.ndarray, "height width"]:
+    """Returns a depth map from a .npy file: depth along the optical axis in metres, 0 where it is unknown.
+
+    Raises:
+        RecordingError: The file is missing, or holds no such array.
+    """
+    depth = load_array(path).astype(np.float32)
+    wrong = ~((depth >= 0) & (depth < np.inf))
+    if wrong.any():
+        raise RecordingError(
+            f"{path} holds a depth of {depth[wrong][0]:g} m, but finite numbers from 0 on were expected; write 0 where "
+            "the depth is not known."
+        )
+    return depth
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import is_deep, load_array, load_image
+from enerf_ns.dataparsers.recording.files import is_deep, load_depth, load_image
 from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.dataparsers.recording.pose_noise import pose_noise
 from enerf_ns.dataparsers.recording.time_units import Times, check_units, unusual_units
@@ -162,11 +162,11 @@ class Frames:
         """Returns depth along the optical axis in metres at the middles of downscaled pixels, 0 where it is unknown.
 
         Raises:
-            RecordingError: The file is missing or holds no array.
+            RecordingError: The file is missing or holds no depth map.
         """
         if self.depth_filenames is None:
             return None
-        depth = load_array(self.depth_filenames[index]).astype(np.float32)
+        depth = load_depth(self.depth_filenames[index])
         camera = self.picture_camera
         rows, columns = (
             ((np.arange(side) + 0.5) * self.downscale_factor).astype(int) for side in (camera.height, camera.width)

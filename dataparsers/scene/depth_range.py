@@ -53,6 +53,9 @@ MIN_TILES = 20
 MIN_CHANCE_RATIO = 3.0
 """Smallest ratio of tiles with a depth to those by chance. If a camera only turns, it stays below 2."""
 
+MIN_SHARE_IN_RANGE = 0.2
+"""Share of the measured depths within a depth range, below which the range is taken for a wrong one."""
+
 EVENTS_FOR_DEPTH = 4_000_000
 """Most events that measure the depth of the scene."""
 
@@ -104,6 +107,12 @@ class Parallax:
         """0.7 times the 2nd and 1.4 times the 98th percentile of the depths, metres."""
         near, far = np.percentile(self.depths, [2, 98])
         return 0.7 * float(near), 1.4 * float(far)
+
+    def contradicts(self, depth_range: tuple[float, float]) -> bool:
+        """Whether hardly any of the depths lie within a range (nearest, farthest; metres)."""
+        near, far = depth_range
+        within = (self.depths > near) & (self.depths < far)
+        return self.is_shown and bool(np.mean(within) < MIN_SHARE_IN_RANGE)
 
 
 def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:

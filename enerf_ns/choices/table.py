@@ -11,6 +11,8 @@ from rich.text import Text
 from enerf_ns.choices.resolution import Choice
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
 from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.inspection.agreement import why_no_search
+from enerf_ns.dataparsers.inspection.evidence import Evidence
 from enerf_ns.dataparsers.inspection.problems import find_problems
 from enerf_ns.dataparsers.recording.errors import printable
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
@@ -53,9 +55,13 @@ def recording_table(parser: EventDataParserConfig) -> Table:
         table.add_row(name, Text(printable(value)))
     for note in (*recording.notes, *index.notes):
         table.add_row("note", Text(printable(note), "yellow"))
-    for problem in find_problems(recording, depth):
+    evidence = Evidence.of(recording)
+    unknown = filter(None, [why_no_search(recording, depth), *evidence.unknown])
+    for problem in [*find_problems(recording, depth), *evidence.problems]:
         what, advice = printable(problem.what), printable(problem.advice)
         table.add_row(Text("problem", "red"), Text.assemble((what, "red"), f" {advice}"))
+    for one in unknown:
+        table.add_row("note", Text(printable(one.sentence), "yellow"))
     return table
 
 

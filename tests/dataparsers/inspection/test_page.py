@@ -157,8 +157,13 @@ def test_one_problem_is_not_two(tmp_path: Path):
 
 def test_the_absence_of_problems_is_stated(tmp_path: Path):
     inspection = replace(Inspection.of(read_recording(write_esim(tmp_path / "esim"))), problems=[])
-    assert "No problems were found." in Page(inspection.page()).text
-    assert "No problems were found." in shown_in_terminal(inspection)
+    assert len(inspection.unknown) == 2
+    for whole in (inspection, replace(inspection, unknown=())):
+        page, shown = Page(whole.page()).text, " ".join(shown_in_terminal(whole).split())
+        for text in (page, shown):
+            assert ("No problems were found." in text) == (not whole.unknown)
+            assert ("No problems were found in what can be measured." in text) == bool(whole.unknown)
+            assert all(one.sentence in text for one in whole.unknown)
 
 
 def test_what_is_unknown_about_depth_is_a_problem_and_not_the_end(tmp_path: Path):
@@ -271,7 +276,7 @@ def test_the_path_is_seen_from_above():
     )  # x right, z ahead along the world's y, y down along the world's -z
     tilt = Rotation.from_rotvec([0.3, -0.2, 0.1])
     trajectory = Trajectory(times, tilt.apply(places), (tilt * upright).as_quat())
-    inspection = Inspection.of(two_cameras(trajectory, trajectory))
+    inspection = Inspection.of(replace(two_cameras(trajectory, trajectory), frames=None))
     drawn = path_drawn(inspection)
     first, last = inspection.statistics.edges[[0, -1]]
     seen = torch.from_numpy(np.linspace(first, last, len(drawn)).astype(np.int64))
@@ -285,7 +290,7 @@ def test_no_path_is_drawn_where_there_are_no_poses():
     keep = (times < 301_000_000) | (times > 699_000_000)
     path = np.stack([np.interp(times, np.arange(11) * 10**8, column) for column in rows.T], axis=1)[keep]
     trajectory = Trajectory(times[keep], path[:, :3], path[:, 3:])
-    inspection = Inspection.of(two_cameras(trajectory, trajectory))
+    inspection = Inspection.of(replace(two_cameras(trajectory, trajectory), frames=None))
     hidden = np.isnan(path_drawn(inspection)).any(axis=1)
     assert 0.38 < hidden.mean() < 0.42
     assert inspection.numbers()["pose coverage"].endswith("1 gap")

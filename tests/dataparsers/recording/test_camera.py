@@ -65,6 +65,7 @@ def test_a_distortion_without_inverse_is_refused():
         (dict(fx=0.0), "the focal lengths 0 and 335.353, but they must be above 0"),
         (dict(fy=float("nan")), "the focal lengths 335.419 and nan"),
         (dict(fx=1e9), "which fits no lens; state all in pixels"),
+        (dict(fx=3353.0, fy=33.5), "focal lengths 3353 and 33.5 .* which fits no lens"),
         (dict(cx=float("inf")), "which fits no lens; state all in pixels"),
         (dict(distortion=(0.1, 0.2, 0.3)), "of the model radtan, but finite numbers k1 k2 p1 p2 and perhaps k3"),
         (dict(distortion=(0.1, 0.2, 0.3, float("nan"))), "of the model radtan, but finite numbers"),

@@ -2,19 +2,24 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageCms
 from recordings import HEIGHT, WIDTH
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import (
+    image_size,
     in_colour,
     load_array,
+    load_depth,
     load_image,
     of_file,
     partial_of,
@@ -43,6 +48,73 @@ def test_load_image_gives_one_or_three_channels(tmp_path: Path, mode: str, chann
     assert loaded.dtype == (np.uint16 if mode == "I;16" else np.uint8) and loaded.shape == (HEIGHT, WIDTH, channels)
     tolerance = 51 if mode == "P" else 0  # a palette of 216 colours is coarse
     np.testing.assert_allclose(loaded.astype(int), np.repeat(grey[..., None], channels, 2), atol=tolerance)
+
+
+PICTURE = Image.fromarray(np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3))
+
+
+def turned_by(orientation: int) -> Image.Exif:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    return exif
+
+
+def in_lab(image: Image.Image) -> Image.Image:
+    profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
+    return ImageCms.applyTransform(image, ImageCms.buildTransform(*profiles, "RGB", "LAB"))
+
+
+def pages(path: Path) -> None:
+    PICTURE.save(path, save_all=True, append_images=[PICTURE.rotate(180)])
+
+
+def deep_pages(path: Path) -> None:
+    cv2.imwritemulti(str(path), [np.full((HEIGHT, WIDTH), 1000 * page, np.uint16) for page in (1, 2)])
+
+
+NOT_PLAIN: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "turned JPEG": ("a.jpg", lambda path: PICTURE.save(path, exif=turned_by(6)), r"by its EXIF \(orientation 6\)"),
+    "mirrored PNG": ("a.png", lambda path: PICTURE.save(path, exif=turned_by(2)), r"by its EXIF \(orientation 2\)"),
+    "turned WebP": ("a.webp", lambda path: PICTURE.save(path, exif=turned_by(3)), r"by its EXIF \(orientation 3\)"),
+    "turned TIFF": ("a.tif", lambda path: PICTURE.save(path, tiffinfo={274: 8}), r"by its EXIF \(orientation 8\)"),
+    "CMYK JPEG": ("a.jpg", lambda path: PICTURE.convert("CMYK").save(path), "colours in CMYK, but grey or RGB"),
+    "CMYK TIFF": ("a.tif", lambda path: PICTURE.convert("CMYK").save(path), "colours in CMYK, but grey or RGB"),
+    "YCbCr TIFF": ("a.tif", lambda path: PICTURE.convert("YCbCr").save(path), "colours in YCbCr, but grey or RGB"),
+    "LAB TIFF": ("a.tif", lambda path: in_lab(PICTURE).save(path), "colours in LAB, but grey or RGB"),
+    "GIF": ("a.gif", pages, "holds 2 pictures, but one was expected"),
+    "APNG": ("a.png", pages, "holds 2 pictures, but one was expected"),
+    "WebP": ("a.webp", pages, "holds 2 pictures, but one was expected"),
+    "TIFF of pages": ("a.tif", pages, "holds 2 pictures, but one was expected"),
+    "deep TIFF of pages": ("a.tif", deep_pages, "holds 2 pictures, but one was expected"),
+}
+"""Pictures whose stored pixels are not what a viewer shows: the name of the file, how to write it, and what is said."""
+
+
+@pytest.mark.parametrize("name", NOT_PLAIN)
+def test_a_picture_that_is_not_one_array_of_grey_or_rgb_is_refused(name: str, tmp_path: Path):
+    file, write, message = NOT_PLAIN[name]
+    write(tmp_path / file)
+    for read in (load_image, image_size):
+        with pytest.raises(RecordingError, match=f"^{re.escape(str(tmp_path / file))} .*{message}"):
+            read(tmp_path / file)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
+def test_an_upright_picture_is_accepted(suffix: str, tmp_path: Path):
+    PICTURE.save(tmp_path / f"a{suffix}", exif=turned_by(1))
+    assert load_image(tmp_path / f"a{suffix}").shape == (HEIGHT, WIDTH, 3)
+    assert image_size(tmp_path / f"a{suffix}") == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_what_is_no_depth_is_refused(value: float, tmp_path: Path):
+    depth = np.ones((HEIGHT, WIDTH), np.float32)
+    np.save(tmp_path / "a.npy", depth)
+    np.testing.assert_array_equal(load_depth(tmp_path / "a.npy"), depth)
+    depth[3, 4] = value
+    np.save(tmp_path / "a.npy", depth)
+    with pytest.raises(RecordingError, match=rf"a\.npy holds a depth of {value:g} m, but .* write 0 where"):
+        load_depth(tmp_path / "a.npy")
 
 
 def test_what_is_transparent_is_laid_over_white(tmp_path: Path):

@@ -16,10 +16,11 @@ import pytest
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
-from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, poses
+from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, poses, write_esim
 from small_runs import set_up, small_config
 
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+from enerf_ns.dataparsers.formats.event_recording import read as read_own
 from enerf_ns.dataparsers.formats.event_recording import write
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection.page import Inspection
@@ -259,6 +260,19 @@ def test_a_stated_white_level_that_is_none_is_refused(deep: Path, tmp_path: Path
     (tmp_path / "own/recording.json").write_text(json.dumps(about))
     with pytest.raises(RecordingError, match=r"recording\.json holds white_level = .*, but a number above 0"):
         read_recording(tmp_path / "own")
+
+
+@pytest.mark.parametrize("white", [1, 65535])
+def test_a_white_level_of_frames_of_8_bits_is_refused(tmp_path: Path, white: float):
+    (tmp_path / "own").mkdir()
+    write(read_recording(write_esim(tmp_path / "esim")), tmp_path / "own")
+    about = json.loads((tmp_path / "own/recording.json").read_text())
+    for stated in (255, white):
+        (tmp_path / "own/recording.json").write_text(json.dumps(about | {"white_level": stated}))
+        if stated == 255:
+            read_own(tmp_path / "own")
+    with pytest.raises(RecordingError, match=rf"holds white_level = {white}, but .*00000\.png has 8 bits"):
+        read_own(tmp_path / "own")
 
 
 def test_frames_above_the_stated_white_level_are_refused(deep: Path, tmp_path: Path):
