@@ -86,7 +86,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
     setup = _setup(settings, view, exposures, camera.sensor)
     is_new = not output_dir.exists()
     try:
-        output_dir.mkdir(parents=True, exist_ok=True)
+        output_dir.mkdir(parents=True, exist_ok=not is_new)  # another command may have made it meanwhile
     except OSError as error:
         raise OutputError(
             f"{output_dir} cannot be made a folder ({error.strerror}); give another --output-dir."
