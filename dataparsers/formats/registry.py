@@ -7,6 +7,7 @@ nerfstudio.dataparser_configs.
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,10 @@ _FORMATS: dict[str, Format] = {}
 
 FILES_OF_A_RECORDING = 2
 """Least number of files of a format that mark a folder as a recording, which is never written to."""
+
+
+NAME_SHOWN = 60
+"""Most letters that an error shows of a name in a file, from its end."""
 
 
 def register(format: Format) -> None:
@@ -128,8 +133,14 @@ def _read_folder(path: Path, format: str, **options: object) -> EventRecording:
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
     found = _find_format(path) if format == "auto" else format_named(format)
     _check_options(path, found, options)
-    with of_file(path):
-        return found.read(path, **options)
+    try:
+        with of_file(path):
+            return found.read(path, **options)
+    except OSError as error:  # as of a name that is longer than names can be
+        raise RecordingError(
+            f"{path} names ...{os.fsdecode(error.filename or path)[-NAME_SHOWN:]}, which cannot be opened "
+            f"({error.strerror}); check the names in its files, and who may read them."
+        ) from error
 
 
 def _check_options(path: Path, found: Format, options: dict[str, object]) -> None:
