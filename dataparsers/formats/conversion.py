@@ -148,18 +148,24 @@ def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
     return camera_json(camera)
 
 
-@contextmanager
-def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
-    """Yields a temporary folder, which becomes the output at the end of the block if no error occurs."""
-    check_outside_recordings("--output-dir", output_dir, source)
+def _check_is_free(output_dir: Path) -> None:
+    """Raises OutputError if there is a file, or a folder with content."""
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
         )
+
+
+@contextmanager
+def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
+    """Yields a temporary folder, which becomes the output at the end of the block if no error occurs."""
+    check_outside_recordings("--output-dir", output_dir, source)
+    _check_is_free(output_dir)
     partial = partial_of(output_dir)
     try:
         partial.mkdir(parents=True)
         yield partial
+        _check_is_free(output_dir)  # another command may have written it meanwhile
         if output_dir.exists():
             output_dir.rmdir()
         partial.rename(output_dir)

@@ -47,8 +47,14 @@ class Value:
         return inner
 
     def get(self, key: str) -> Value | None:
-        """Returns the inner value, or None where this object lacks it or holds null."""
-        found = self.found.get(key) if isinstance(self.found, dict) else None
+        """Returns the inner value, or None where this object lacks it or holds null.
+
+        Raises:
+            RecordingError: This is no object.
+        """
+        if not isinstance(self.found, dict):
+            raise self.wrong("an object was")
+        found = self.found.get(key)
         return None if found is None else self._inner(key, found)
 
     def values(self, count: int | None = None) -> list[Value]:

@@ -7,6 +7,7 @@ nerfstudio.dataparser_configs.
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,10 @@ _FORMATS: dict[str, Format] = {}
 
 FILES_OF_A_RECORDING = 2
 """Least number of files of a format that mark a folder as a recording, which is never written to."""
+
+
+NAME_SHOWN = 60
+"""Most letters that an error shows of a name in a file, from its end."""
 
 
 def register(format: Format) -> None:
@@ -139,8 +144,14 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
                 "own poses; convert it without --poses, and give --poses with the new recording."
             )
         options["poses"] = poses
-    with of_file(path):
-        return found.read(path, **options)
+    try:
+        with of_file(path):
+            return found.read(path, **options)
+    except OSError as error:  # as of a name that is longer than names can be
+        raise RecordingError(
+            f"{path} names ...{os.fsdecode(error.filename or path)[-NAME_SHOWN:]}, which cannot be opened "
+            f"({error.strerror}); check the names in its files, and who may read them."
+        ) from error
 
 
 def _check_options(path: Path, found: Format, options: dict[str, object]) -> None:

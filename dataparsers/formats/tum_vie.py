@@ -318,7 +318,7 @@ def _read_prepared_rig(folder: Path, side: str, sequence: str, frame_files: tupl
     calibration = _read_calibration(path)
     raw_path = folder / "calibration.json"
     raw = _read_calibration(raw_path) if raw_path.exists() else calibration
-    has_raw = raw.get("intrinsics") is not None
+    has_raw = raw_path.exists() or raw.get("intrinsics") is not None
 
     camera = _undistorted(calibration, 2 + index, *SENSOR_SIZE)
     rectify_map = _find_one(folder, f"*rectify_map_{side}.h5", "a rectify map")

@@ -119,6 +119,13 @@ class Camera:
                 np.union1d(np.arange(0, side, CHECKED_STEP), side - 1) for side in (self.width, self.height)
             )
             self._directions_at(*np.meshgrid(columns, rows))
+            try:
+                self.undistorted()
+            except ValueError as error:
+                raise ValueError(
+                    f"the distortion {self.distortion} of the model {self.model}, which leaves no picture without "
+                    "distortion; check the coefficients."
+                ) from error
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 3"]:

@@ -122,6 +122,18 @@ SEAMS = (
     ),
     *(Seam(f"{_PANEL}.{name}", "tidy_control_panel") for name in ("_max_res", "_train_speed", "_train_util")),
     Seam("viser._viser:CameraHandle._state", "replace_camera_callbacks"),
+    Seam("viser.infra._infra:WebsockServer.start", "method.viewer.guard", ("self",)),
+    Seam("viser.infra._infra:WebsockServer._http_server_root", "method.viewer.guard serves the page alone"),
+    Seam(
+        "viser.infra._infra:WebsockMessageHandler._handle_incoming_message",
+        "method.viewer.guard leaves out impossible cameras",
+        ("self", "client_id", "message"),
+    ),
+    Seam("viser:GuiApi._handle_gui_updates", "method.viewer.guard checks values", ("self", "client_id", "message")),
+    Seam("viser:GuiApi._handle_file_transfer_start", "method.viewer.guard takes no files"),
+    Seam("viser:GuiApi._gui_input_handle_from_id", "method.viewer.guard"),
+    Seam("viser._gui_handles:_GuiInputHandle._impl", "method.viewer.guard"),
+    Seam("viser._gui_handles:_GuiHandleState.message_type", "method.viewer.guard tells text from other inputs"),
     Seam("viser._viser:_CameraHandleState.camera_cb", "replace_camera_callbacks"),
     *(
         Seam(f"{_ENCODING}.{name}", "kernels.fast_hash_encoding; it also sets the class of encodings that exist")

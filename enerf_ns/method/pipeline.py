@@ -36,6 +36,7 @@ from enerf_ns.method.held_out_views import held_out_view, held_out_views, scores
 from enerf_ns.method.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.method.model import EnerfModel, EnerfModelConfig
 from enerf_ns.method.stopwatch import Stopwatch
+from enerf_ns.method.viewer.guard import guard_viser
 from enerf_ns.poses.refiner import (
     BEGINS_UNTIL,
     FIRST_STEP,
@@ -97,6 +98,7 @@ class EnerfPipelineConfig(VanillaPipelineConfig):
             SystemExit: The recording, or a setting, cannot be used; with one sentence.
         """
         silence_known_warnings()
+        guard_viser()
         make_ffmpeg_available()
         allow_numpy_scalars_in_checkpoints()
         with exit_with_a_sentence():

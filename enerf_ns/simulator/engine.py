@@ -67,6 +67,7 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
     output_dir = absolute(output_dir)
     check_outside_recordings("--output-dir", output_dir, *settings.reads)
     remove_leftovers(output_dir)
+    is_new = not output_dir.exists()
     if output_dir.exists() and (not output_dir.is_dir() or any(output_dir.iterdir())):
         raise OutputError(
             f"{output_dir} exists already and is not an empty folder; give another --output-dir or move it away."
@@ -84,9 +85,8 @@ def simulate(settings: SimulationSettings, output_dir: Path, preview: bool = Fal
             notes.append(f"--colour changes nothing, since {seen} is grey.")
     camera = _EventCamera(settings, first, view.start)
     setup = _setup(settings, view, exposures, camera.sensor)
-    is_new = not output_dir.exists()
     try:
-        output_dir.mkdir(parents=True, exist_ok=True)
+        output_dir.mkdir(parents=True, exist_ok=not is_new)  # another command may have made it meanwhile
     except OSError as error:
         raise OutputError(
             f"{output_dir} cannot be made a folder ({error.strerror}); give another --output-dir."

@@ -20,6 +20,7 @@ from enerf_ns.dataparsers.formats.writer import Rig
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
+from enerf_ns.simulator import engine
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
@@ -141,6 +142,18 @@ def test_the_same_seed_writes_the_same_files_and_another_seed_others(tmp_path):
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     assert (tmp_path / "a/images/00000.png").read_bytes() != (tmp_path / "c/images/00000.png").read_bytes()
+
+
+def test_two_that_start_at_once_do_not_write_into_one_folder(tmp_path, monkeypatch):
+    def other_is_faster(*arguments):
+        (tmp_path / "new").mkdir()
+        return view_of(*arguments)
+
+    view_of = engine.view_of
+    monkeypatch.setattr(engine, "view_of", other_is_faster)
+    with pytest.raises(OutputError, match=r"new cannot be made a folder \(File exists\)"):
+        simulate(SimulationSettings("shapes", width=16, height=12, duration=0.02), tmp_path / "new")
+    assert not list((tmp_path / "new").iterdir())
 
 
 def test_an_existing_recording_is_not_overwritten(tmp_path):

@@ -90,6 +90,10 @@ class SceneView(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         """Fills the viewer. The panel comes first, for browsers that are there before the scene."""
         super()._setup(viewer)
+        asked, port = viewer.config.websocket_port, viewer.viser_server.get_port()
+        if asked and asked != port:
+            told = [line.replace(f":{asked}", f":{port}") for line in viewer.viewer_info]
+            viewer.viewer_info = [f"The port {asked} is taken, so that another one is used.", *told]
         outputs, dataset = self._manager.train_dataparser_outputs, self._manager.train_dataset
         self._transform, self._scale = outputs.metadata["transform"].numpy(), outputs.dataparser_scale
         self._camera = self._recording.camera.undistorted()

@@ -28,6 +28,9 @@ MOVING_SECONDS = 0.15
 SMALLEST_SIDE = 160
 """Least longer side of a picture in pixels, however long it takes."""
 
+LARGEST_SIDE = 2048
+"""Largest longer side of a picture in pixels, as of the slider "Max res", which browsers alone keep to."""
+
 SIZES = 3
 """Number of pictures of a view from the moment that it rests: small, of middle size, and whole."""
 
@@ -115,7 +118,7 @@ class ViewRenderer(RenderStateMachine):
             except IOChangeException:
                 continue
             self._send_output_to_viewer(outputs, static_render=size > 0)
-            is_whole = max(outputs["rgb"].shape[:2]) >= self.viewer.control_panel.max_res
+            is_whole = max(outputs["rgb"].shape[:2]) >= self._whole
             size += 2 if is_whole and size == 0 else 1  # the whole one is sent again at rest, in better quality
             finished = time.monotonic()
             again = finished + TRAINING_SHARE * (finished - now)
@@ -164,9 +167,14 @@ class ViewRenderer(RenderStateMachine):
             outputs["gl_z_buf_depth"] = outputs["depth"] * (rays.directions @ axis)[..., None]
         return self._shown(outputs, rays)
 
+    @property
+    def _whole(self) -> int:
+        """Longer side of the whole picture in pixels."""
+        return min(max(self.viewer.control_panel.max_res, 1), LARGEST_SIDE)
+
     def _resolution(self, size: int, aspect: float) -> tuple[int, int]:
         """Height and width (pixels) of a picture. The middle one is as much larger than the small as than the whole."""
-        whole, longer = self.viewer.control_panel.max_res, max(aspect, 1.0 / aspect)
+        whole, longer = self._whole, max(aspect, 1.0 / aspect)
         small = (self.rays_per_second * MOVING_SECONDS * longer) ** 0.5
         small = min(max(small, SMALLEST_SIDE), whole)
         side = (small, (small * whole) ** 0.5, whole)[size]

@@ -9,7 +9,7 @@ import pytest
 from recordings import EVENTS, joined, write_esim
 from test_event_files import FORMATS, events
 
-from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording
+from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 
@@ -45,6 +45,20 @@ def test_what_cannot_be_written_or_read_leaves_nothing(tmp_path: Path, convert):
     with pytest.raises(OutputError, match="could not be written"):
         convert(source, tmp_path / "full/mine/new")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_what_another_command_wrote_meanwhile_stays(tmp_path: Path):
+    source, new = write_esim(tmp_path / "esim"), tmp_path / "new"
+    with (
+        pytest.raises(OutputError, match="new exists already and is not an empty folder"),
+        new_folder(source, new) as own,
+    ):
+        (own / "mine").touch()
+        new.mkdir()
+        (new / "theirs").touch()
+    assert sorted(path.name for path in tmp_path.rglob("*") if path.name not in ("esim", "new")) == sorted(
+        ["theirs", *(path.name for path in source.rglob("*"))]
+    )
 
 
 def test_options_that_the_format_lacks_and_folders_within(tmp_path: Path):

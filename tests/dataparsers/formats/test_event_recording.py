@@ -408,7 +408,7 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     ),
     "frame camera is a text": (
         {"frame_camera": "left"},
-        'recording.json holds frame_camera = "left", but an object with',
+        'recording.json holds frame_camera = "left", but an object was expected',
     ),
     "mirrored": (frame_camera(event_camera_from_frame_camera=MIRROR), "is no rotation"),
     "stretched": (frame_camera(event_camera_from_frame_camera=(np.eye(4) * 2).tolist()), "is no rotation"),

@@ -5,12 +5,16 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
+import resource
 import shutil
+import signal
 import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from fractions import Fraction
@@ -20,6 +24,7 @@ from typing import Any, Literal
 
 import h5py
 import numpy as np
+import psutil
 import pytest
 import test_eds
 import test_esim_npz
@@ -34,7 +39,7 @@ from recordings import HEIGHT, WIDTH, joined, seconds, write_davis, write_esim
 from scipy.spatial.transform import Rotation
 from test_bad_input import contents, is_one_sentence
 
-from enerf_ns.dataparsers.formats.registry import _read_folder, read_recording
+from enerf_ns.dataparsers.formats.registry import _read_folder, formats, read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -232,7 +237,9 @@ def plain_tum_vie(folder: Path, raw: bool) -> Plain:
 
 def plain_esim(folder: Path) -> Plain:
     pieces = [np.load(file) for file in sorted(folder.glob("events/*.npy"))]
-    events = np.concatenate([np.array([[round(v) for v in row] for row in piece[:, :4].tolist()]) for piece in pieces])
+    events = np.concatenate(
+        [np.array([[round(v) for v in row] for row in piece[:, :4].tolist()]).reshape(-1, 4) for piece in pieces]
+    )
     stamps = stamps_in(folder, "images/image_stamps_ns.txt", "ns")
     return Plain(events, *poses_in(folder / "0_poses_all.txt", "ns"), stamps, stamps)
 
@@ -322,9 +329,9 @@ KINDS_OF_TABLES = {
     "others": ("*",),
 }
 
-NO_NUMBERS = ("nan", "inf", "1e400", "abc", "½", "٣", "1_0", "0x10", "1,5", "--1", "1e", "")
-ODD_NUMBERS = ("-1", "0", "1e300", "999999999999999999999", "0.1", "2e9")
-NO_VALUES = ("abc", "two\nlines", [], {}, [1], True, float("nan"), float("inf"), [[[]]])
+NO_NUMBERS = ("nan", "inf", "1e400", "abc", "½", "٣", "1_0", "0x10", "1,5", "--1", "1e", "", "\0")
+ODD_NUMBERS = ("-1", "0", "1e300", "1e-300", "-0", "999999999999999999999", "9" * 5000, "0." + "3" * 4000, "0.1", "2e9")
+NO_VALUES = ("abc", "two\nlines", "\ud800", "x" * 10**5, [], {}, [1], True, float("nan"), float("inf"), [[[]]])
 ODD_VALUES = (-1, 0, 1e-300, 1e300, 10**30, 2**31, 0.5)
 
 OPTIONAL_KEYS = (
@@ -348,7 +355,8 @@ def matches(path: Path, patterns: tuple[str, ...]) -> bool:
 def damage_file(draw: Draw, layout: Layout, path: Path) -> Outcome:
     """Any file as a whole, or as bytes."""
     content = path.read_bytes()
-    kind = draw(st.sampled_from(["removed", "empty", "cut", "overwritten", "appended", "a folder"]))
+    kinds = ["removed", "empty", "cut", "overwritten", "appended", "a folder", "shuffled", "bits flipped", "zeros"]
+    kind = draw(st.sampled_from([*kinds, "another file"]))
     note(kind)
     if kind == "removed":
         path.unlink()
@@ -365,6 +373,24 @@ def damage_file(draw: Draw, layout: Layout, path: Path) -> Outcome:
         if path.suffix in IMAGES:
             return "refused or the same"
         return "refused or plain" if path.suffix in (*TABLES, ".yaml") else "refused"
+    if kind in ("shuffled", "bits flipped"):
+        seed, new = draw(st.integers(0, 10**6)), bytearray(content)
+        if kind == "shuffled":
+            parts = [content[i : i + 16] for i in range(0, len(content), 16)]
+            new = b"".join(random.Random(seed).sample(parts, len(parts)))
+        for place in random.Random(seed).choices(range(8 * len(content)), k=20 * (kind == "bits flipped")):
+            new[place // 8] ^= 1 << place % 8  # type: ignore[index]
+        path.write_bytes(new)
+        return "refused or the same" if path.suffix in WITH_CHECKSUMS else "refused or plain"
+    if kind == "zeros":
+        path.write_bytes(bytes(len(content)))
+        return "refused or plain" if path.suffix == ".conf" else "refused"
+    if kind == "another file":
+        others = [
+            other for other in sorted(path.parents[0].iterdir()) if other.is_file() and other.suffix != path.suffix
+        ]
+        path.write_bytes(draw(st.sampled_from(others)).read_bytes() if others else b"another")
+        return "refused or plain" if path.suffix == ".conf" else "refused"
     if kind == "overwritten":
         start, new = draw(st.integers(0, len(content) - 1)), draw(st.binary(min_size=1, max_size=4))
         path.write_bytes((content[:start] + new + content[start + len(new) :])[: len(content)])
@@ -466,7 +492,8 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
 
 def kinds_of_damage(name: str, array: np.ndarray) -> list[str]:
     """What may be done to an array of this name."""
-    kinds = ["another type"] + ["one more", "one fewer"] * (array.ndim > 0) + ["transposed"] * (array.ndim > 1)
+    kinds = ["another type"] + ["one more", "one fewer", "none"] * (array.ndim > 0) + ["transposed"] * (array.ndim > 1)
+    kinds += ["other byte order"] * (array.dtype.kind in "iuf" and array.dtype.itemsize > 1)
     if name == "rows":
         kinds += ["x", "t", "p", "part of a pixel", "not finite", "scaled", "unsorted", "axes swapped", "wider type"]
     elif name in TIMES:
@@ -493,6 +520,10 @@ def damage_array(draw: Draw, name: str, array: np.ndarray) -> tuple[np.ndarray, 
         return np.array(5) if array.dtype.kind in "US" else array.astype(draw(st.sampled_from(types))), "refused"
     if kind == "wider type":
         return array.astype(draw(st.sampled_from(["<i8", ">i8"]))), "the same"
+    if kind == "other byte order":
+        return array.astype(array.dtype.newbyteorder()), "the same"
+    if kind == "none":
+        return array[:0], "refused or plain" if name in ARRAYS_OF_ANY_LENGTH else "refused"
     if kind in ("one more", "one fewer"):
         changed = np.append(array, array[-1:], axis=0) if kind == "one more" else array[:-1]
         return changed, "refused or plain" if name in ARRAYS_OF_ANY_LENGTH else "refused"
@@ -718,14 +749,50 @@ def check_frames(recording: EventRecording, undamaged: EventRecording) -> None:
     assert found >= expected or any(re.search("frames|images", sentence) for sentence in recording.notes)
 
 
+SECONDS, BYTES = 30.0, 2 * 10**9
+"""Processor time and memory that reading a small recording never takes, whatever is wrong with it."""
+
+
+class TakesTooLong(BaseException):
+    """Is no error that a reader turns into a sentence."""
+
+
+@contextmanager
+def within_limits() -> Iterator[None]:
+    """Fails where the block takes more than `SECONDS`, or more than `BYTES` beyond what the process holds before.
+
+    Of Linux, the largest memory is asked for, which is set back first. Four times as much cannot be had at all.
+    """
+
+    def late(*_: object) -> None:
+        raise TakesTooLong(f"more than {SECONDS} s of processor time")
+
+    before = signal.signal(signal.SIGPROF, late)
+    held, limits = psutil.Process().memory_info(), resource.getrlimit(resource.RLIMIT_AS)
+    clear, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+    if clear.exists():
+        clear.write_text("5")
+    resource.setrlimit(resource.RLIMIT_AS, (held.vms + 4 * BYTES, limits[1]))
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        signal.signal(signal.SIGPROF, before)
+    if clear.exists() and (peak := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
+        assert 1024 * int(peak[1]) - held.rss < BYTES
+
+
 def read_or_refuse(folder: Path, format: str) -> tuple[EventRecording, dict[str, Any]] | None:
     """A recording and its facts, or None where it is refused with one sentence that says where."""
     _read_folder.cache_clear()  # of cameras with tables of megabytes
     try:
-        recording = read_recording(folder, format)
-        return recording, facts(recording)
+        with within_limits():
+            recording = read_recording(folder, format)
+            return recording, facts(recording)
     except RecordingError as error:
-        note(str(error))
+        note(str(error)[:2000])
         assert is_one_sentence(str(error))
         assert str(folder) in str(error)
     return None
@@ -779,6 +846,23 @@ def template(request: pytest.FixtureRequest, templates: Callable[[str], Template
 
 
 FUZZ = settings(deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def test_all_formats_are_damaged():
+    """A new format needs a layout here."""
+    assert {layout.format for layout in LAYOUTS.values()} == {format.name for format in formats()}
+
+
+@pytest.mark.parametrize("fault", ["time", "memory"])
+def test_limits_are_noticed(monkeypatch: pytest.MonkeyPatch, fault: str):
+    """Else the tests below could not fail."""
+    monkeypatch.setitem(within_limits.__wrapped__.__globals__, "SECONDS", 0.2)
+    monkeypatch.setitem(within_limits.__wrapped__.__globals__, "BYTES", 10**8)
+    with pytest.raises((TakesTooLong, AssertionError)), within_limits():
+        if fault == "memory":
+            np.ones(2 * 10**7)
+        while fault == "time":
+            pass
 
 
 def test_undamaged(template: Template):
@@ -954,6 +1038,26 @@ FOUND: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "esim_npz",
         change("views/transforms_test.json", "frames", 0, "transform_matrix", 3, 3, value=True),
         "but a matrix of 4 x 4 numbers was expected",
+    ),
+    "coefficient of 2^31": (
+        "tum_vie_raw",
+        change("camera-calibrationA.json", "value0", "intrinsics", 2, "intrinsics", "k1", value=2**31),
+        "which leaves no picture without distortion",
+    ),
+    "text for a calibration": (
+        "tum_vie_prepared",
+        change("calibration.json", "value0", value="abc"),
+        "lacks value0.intrinsics",
+    ),
+    "calibration without intrinsics": (
+        "tum_vie_prepared",
+        change("calibration.json", "value0", "intrinsics", value=None),
+        "lacks value0.intrinsics",
+    ),
+    "name of 5000 letters": (
+        "davis",
+        edit("images.txt", "images/", "x" * 5000),
+        "which cannot be opened (File name too long)",
     ),
 }
 

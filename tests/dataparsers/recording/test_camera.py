@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
+from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
 
 PINHOLE = Camera(12, 10, 20.0, 21.0, 6.0, 4.5)
 RADTAN = Camera(
@@ -169,3 +169,10 @@ def test_a_rotation_neither_stretches_nor_mirrors():
     for wrong in (1.01 * turned, turned @ np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)):
         with pytest.raises(ValueError, match="is no rotation"):
             check_rotation(wrong)
+
+
+@pytest.mark.parametrize("model", ["fisheye", "radtan"])
+def test_a_distortion_that_leaves_no_picture_is_refused(model: CameraModel):
+    """Found by damaged files: each pixel has a direction, but no picture without distortion fits into them."""
+    with pytest.raises(ValueError, match="distortion"):
+        Camera(1280, 720, 1050.0, 1049.0, 640.0, 260.0, (2.0**31, -0.05, 0.2, -0.2), model)

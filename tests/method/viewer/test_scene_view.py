@@ -65,11 +65,12 @@ def pipeline(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Enerf
 
 @pytest.fixture(scope="module")
 def viewer(pipeline: EnerfPipeline, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
-    """As of ns-viewer, on that run."""
+    """As of ns-viewer, on that run; the port that it is to have is taken."""
     folder = tmp_path_factory.mktemp("viewed")
     config = small_config(Path(), Path()).viewer
     config.websocket_port = free_port()
-    viewer = Viewer(config, folder / "log.txt", folder, pipeline, train_lock=Lock())
+    with socket.create_server(("127.0.0.1", config.websocket_port)):
+        viewer = Viewer(config, folder / "log.txt", folder, pipeline, train_lock=Lock())
     viewer.init_scene(pipeline.datamanager.train_dataset, "completed")
     viewer.update_scene(step=7)
     yield viewer
@@ -126,6 +127,13 @@ def at_rest(client: Client) -> np.ndarray:
 def go_back(client: Client, opened: dict[str, Any]) -> None:
     client.set("First view", True)
     wait_for(lambda: all(np.allclose(client.camera[name], value, atol=1e-5) for name, value in opened.items()))
+
+
+def test_a_port_that_is_taken_is_told_with_the_one_that_is_used(viewer: Viewer):
+    asked, used = viewer.config.websocket_port, viewer.viser_server.get_port()
+    assert asked != used and reachable(used)
+    taken, where = viewer.viewer_info
+    assert taken == f"The port {asked} is taken, so that another one is used." and f"://localhost:{used} " in where
 
 
 def test_it_opens_behind_the_middle_camera_and_upright(pipeline: EnerfPipeline, client: Client, opened: dict[str, Any]):
