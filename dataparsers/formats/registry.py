@@ -15,7 +15,7 @@ from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, e
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import absolute, of_file
+from enerf_ns.dataparsers.recording.files import absolute, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
@@ -128,6 +128,7 @@ def _read_folder(path: Path, format: str, **options: object) -> EventRecording:
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
     found = _find_format(path) if format == "auto" else format_named(format)
     _check_options(path, found, options)
+    name_links_out(path)
     with of_file(path):
         return found.read(path, **options)
 
