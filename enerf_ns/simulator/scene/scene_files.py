@@ -1,8 +1,7 @@
 """Scenes from files: a mesh file, or a scene file in JSON that puts parts together.
 
-A mesh file may be of any format that trimesh loads: glTF (.glb, .gltf), .obj with .mtl, .ply, .stl, .off, .dae, .3mf
-and others; trimesh needs further packages for some of them. All meshes of the file are taken, each where the file's
-scene graph places it. Units are metres, and z is up. In glTF y is up by definition, so y is turned to z.
+A mesh file is glTF (.glb, .gltf), .obj with .mtl, .ply, .stl or .off. All meshes of the file are taken, each where the
+file's scene graph places it. Units are metres, and z is up. In glTF y is up by definition, so y is turned to z.
 
 The picture of a material (baseColorTexture, map_Kd, TextureFile) is converted from sRGB to linear brightness and
 stretched to a square of a power of two of at most 2048 texels. It repeats outside of [0, 1]. In glTF it is multiplied
@@ -109,6 +108,9 @@ EXPECTED = "the file of a mesh"
 GREY = 0.8
 """Linear brightness of a mesh that has neither a picture nor colours."""
 
+MESHES = ("glb", "gltf", "obj", "ply", "stl", "off")
+"""Suffixes of mesh files. trimesh loads others, but archives and XML may unpack to any size and repeat parts."""
+
 IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".tga", ".gif"}
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -188,10 +190,10 @@ def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
     if not path.exists():
         raise RecordingError(f"{path} is missing; {EXPECTED} was expected.")
     kind = path.suffix.lower().lstrip(".")
-    if kind not in trimesh.available_formats():
+    if kind not in MESHES:
         raise RecordingError(
-            f"{path} is of a type that trimesh does not load with the packages that are installed; give a .glb, .gltf, "
-            ".obj, .ply, .stl or .off file, or a scene file (.json)."
+            f"{path} is of a type that is not read; give a .glb, .gltf, .obj, .ply, .stl or .off file, or a scene file "
+            "(.json)."
         )
     is_gltf = kind in ("glb", "gltf")
     files, pieces = _Files(path), []

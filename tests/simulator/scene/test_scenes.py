@@ -428,6 +428,7 @@ def without_materials(folder: Path) -> Path:
         (lambda folder: folder, ("of a mesh was expected",)),
         (lambda folder: folder / "none.json", ("none.json is missing",)),
         (named("a.blend", "BLENDER"), ("a.blend is of a type", ".obj")),
+        (named("a.3mf", "PK"), ("a.3mf is of a type", ".obj")),
         (named("a.obj", ""), ("a.obj holds no mesh with faces",)),
         (named("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"), ("a.obj holds no mesh with faces",)),
         (named("a.obj", "v 0 0 0\nv 1 0 0\nf 1 2 9\n"), ("a.obj cannot be read",)),
