@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from test_wrong_inputs import SMALL, WHOLE, check_sentence, write_event_file
 from warm_commands import WarmCommands
 
@@ -214,7 +215,7 @@ def test_an_option_never_takes_long(option: str, kind: str, tmp_path: Path, refu
     assert name in sentence
 
 
-OBJ = "mtllib quad.mtl\nv 0 2 0\nv 1 2 0\nv 0 2 1\nusemtl a\nf 1 2 3\n"
+OBJ = "mtllib quad.mtl\nv 0 2 0\nv 1 2 0\nv 0 2 1\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
 MTL = "newmtl a\nmap_Kd picture.png\n"
 
 
@@ -276,6 +277,11 @@ SCENES: dict[str, tuple[str, Place, str]] = {
     "materials of 6 GB": ("quad.obj", obj(quad_mtl=zeros()), "quad.mtl"),
     "picture of the kernel": ("quad.obj", obj(picture_png=link("/proc/kmsg")), "picture.png"),
     "picture of 6 GB": ("quad.obj", obj(picture_png=zeros()), "picture.png"),
+    "picture of 120 million pixels": (
+        "quad.obj",
+        obj(picture_png=lambda path: Image.new("RGB", (12_000, 10_000)).save(path)),
+        "12,000 x 10,000 pixels",
+    ),
     "buffer of the kernel": (
         "quad.gltf",
         lambda folder: (

@@ -80,7 +80,14 @@ from trimesh.visual.material import PBRMaterial
 
 from enerf_ns.dataparsers.formats.columns import FARTHEST
 from enerf_ns.dataparsers.recording.errors import RecordingError, UserError
-from enerf_ns.dataparsers.recording.files import LARGEST_PICTURE, check_is_file, load_image, read_json, reading
+from enerf_ns.dataparsers.recording.files import (
+    LARGEST_PICTURE,
+    check_is_file,
+    image_size,
+    load_image,
+    read_json,
+    reading,
+)
 from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.simulator.scene import textures
 from enerf_ns.simulator.scene.gltf import MOST_TRIANGLES, check_gltf
@@ -99,6 +106,9 @@ from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 
 LARGEST_TEXTURE = 2048
 """Most texels along one side of a texture from a picture. It is halved, once or more, for more than eight pictures."""
+
+MOST_TEXELS = 2**26
+"""Most pixels of a picture that becomes a texture."""
 
 SHAPES = {"box": 3, "ball": 1, "plane": 2}
 """Count of numbers in the size of each shape that needs no file."""
@@ -324,6 +334,8 @@ def _pieces(path: Path, graph: trimesh.Scene, is_gltf: bool, expected: int, note
     largest = LARGEST_TEXTURE
     while len(pictures) * largest**2 > 8 * LARGEST_TEXTURE**2:
         largest //= 2
+    for picture in pictures.values():
+        _check_texels(path, *picture.size)
     images = {key: linear_image(_pixels(picture), largest) for key, picture in pictures.items()}
     pieces, untextured = [], Counter[str]()
     for matrix, mesh in placed:
@@ -381,6 +393,15 @@ def _picture(mesh: Any) -> Image.Image | None:
     """Picture of the material of a mesh, if it has one."""
     material = getattr(getattr(mesh, "visual", None), "material", None)
     return getattr(material, "baseColorTexture", getattr(material, "image", None))
+
+
+def _check_texels(path: Path, width: int, height: int) -> None:
+    """Refuses a picture that takes gigabytes as linear brightness."""
+    if width * height > MOST_TEXELS:
+        raise RecordingError(
+            f"{path} has a texture of {width:,} x {height:,} pixels, but at most {MOST_TEXELS:,} were expected; make "
+            "it smaller."
+        )
 
 
 def _pixels(picture: Image.Image) -> UInt8[np.ndarray, "height width channels"]:
@@ -567,6 +588,7 @@ def _shape(shape: str, size: np.ndarray) -> Piece:
 
 def _picture_of(file: Path) -> Shaped[np.ndarray, "height width channels"]:
     """The image of a file: uint8, or float32 in [0, 1] if the file has more than 8 bits."""
+    _check_texels(file, *image_size(file))
     image = load_image(file)
     return image if image.dtype == np.uint8 else image / np.float32(find_white_level((file,)))
 

@@ -456,6 +456,20 @@ def without_materials(folder: Path) -> Path:
             ("lacks meshes[0].primitives[0].attr",),
         ),
         (corrupted(lambda about: about["bufferViews"][0].update(byteLength=10**6)), ("reaches to byte 1,000,000 of",)),
+        (
+            corrupted(lambda about: about["accessors"][2].update(bufferView=0)),
+            ("triangle at vertex", "with 4 vertices"),
+        ),
+        (corrupted(lambda about: about["nodes"][0].update(matrix=[1e300] * 16)), ("by a matrix that holds 1e+300",)),
+        (
+            corrupted(lambda about: about["nodes"][0].update(scale=[1, 1, float("nan")])),
+            ("nodes[0].scale", "3 numbers"),
+        ),
+        (corrupted(lambda about: about["textures"][0].update(source=5)), ("names images[5] in textures[0].source",)),
+        (
+            corrupted(lambda about: about["nodes"][0].update(name="\ud800")),
+            (r"holds \ud800, which is half of a letter",),
+        ),
         (corrupted(lambda about: about["nodes"][0].pop("mesh")), ("holds no mesh with faces",)),
         (named("a.json", "{"), ("a.json cannot be read as JSON",)),
         (named("a.json", "[]"), ("a.json holds a list",)),
