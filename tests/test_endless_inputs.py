@@ -231,7 +231,7 @@ def obj(**files: Place) -> Place:
 
 def gltf(triangles: int = 1, **changed: object) -> Place:
     """One mesh of so many triangles that all lie in one place, and one node, unless changed."""
-    corners = np.tile(np.float32([[0, 0, -2], [1, 0, -2], [0, 1, -2]]), (triangles, 1))
+    corners = np.tile(np.array([[0, 0, -2], [1, 0, -2], [0, 1, -2]], np.float32), (triangles, 1))
     about: dict[str, object] = {
         "asset": {"version": "2.0"},
         "scene": 0,

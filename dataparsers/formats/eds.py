@@ -311,8 +311,8 @@ def _num_values(node: yaml.Node, known: dict[int, int]) -> int:
         return 1
     if id(node) not in known:
         known[id(node)] = MOST_VALUES + 1  # while its own values are counted, among which it must not be
-        pairs = node.value if node.id == "mapping" else [(item,) for item in node.value]
-        known[id(node)] = 1 + sum(_num_values(item, known) for pair in pairs for item in pair)
+        items = [item if isinstance(item, tuple) else (item,) for item in node.value]  # those of a mapping are pairs
+        known[id(node)] = 1 + sum(_num_values(part, known) for item in items for part in item)
     if known[id(node)] > MOST_VALUES:
         raise ValueError(f"aliases that repeat values more than {MOST_VALUES:,} times")
     return known[id(node)]
