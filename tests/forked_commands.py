@@ -1,9 +1,10 @@
 """The program of `WarmCommands`: it forks processes of commands, and has imported all that they import.
 
 Each line that it reads is a command as JSON: `program` (of `MAIN`), `arguments`, `folder`, `environment`, `output` (the
-file that it prints into), `limit` (seconds, after which it is killed) and `bound` (whether permissions of files bind it
-where it is root, too). It answers each with two lines, the number of its process and its exit code. A process ends as
-Python would end it, but does not take all modules apart, which takes seconds.
+file that it prints into), `limit` (seconds, after which it is killed), `bound` (whether permissions of files bind it
+where it is root, too) and `memory` (bytes that it may use beside those of what is imported). It answers each with two
+lines, the number of its process and its exit code. A process ends as Python would end it, but does not take all modules
+apart, which takes seconds.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import ctypes
 import gc
 import json
 import os
+import resource
 import signal
 import sys
 import traceback
 from importlib import import_module
+from pathlib import Path
 
 from nerfstudio.scripts import eval, render, train
 
@@ -43,6 +46,12 @@ def bind_to_permissions() -> None:
     assert libc.capget(header, sets) == 0
     sets[0] &= ~OVERRIDES  # of the effective ones
     assert libc.capset(header, sets) == 0
+
+
+def bind_to_memory(size: int) -> None:
+    """Lets this process use no more than this number of bytes beside what it uses already."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + size, resource.RLIM_INFINITY))
 
 
 def forked() -> dict:
@@ -73,6 +82,8 @@ if __name__ == "__main__":
     os.chdir(command["folder"])
     if command["bound"]:
         bind_to_permissions()
+    if command["memory"] is not None:
+        bind_to_memory(command["memory"])
     os.environ.clear()
     os.environ.update(command["environment"])
     sys.argv = [command["program"], *command["arguments"]]

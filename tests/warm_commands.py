@@ -59,6 +59,7 @@ class WarmCommands:
         environment: Mapping[str, str] | None = None,
         limit: int = 60,
         bound: bool = False,
+        memory: int | None = None,
     ) -> Started:
         """Starts a command, which is killed after some seconds.
 
@@ -68,6 +69,7 @@ class WarmCommands:
             environment: That of the caller unless given.
             limit: Seconds.
             bound: Whether permissions of files bind it where it is root, too, which needs Linux.
+            memory: Bytes that it may use beside those of what is imported, which needs Linux. Default: any number.
         """
         program, *arguments = map(str, command)
         printed = self._folder / str(self._started)
@@ -78,6 +80,7 @@ class WarmCommands:
             "folder": str(cwd or Path.cwd()),
             "limit": limit,
             "bound": bound,
+            "memory": memory,
         }
         told |= {"environment": {**(environment or os.environ), **ONE_THREAD}, "output": str(printed)}
         if self._program is None:

@@ -16,14 +16,15 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 
 from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
-from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file, reading
+from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
+from enerf_ns.dataparsers.recording.files import LONGEST_LINE, check_image_sizes, image_size, of_file, reading
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -34,6 +35,9 @@ DAVIS240C_SIZE = (240, 180)
 
 EVENT_COLUMNS = "t_s x y p"
 BYTES_AT_A_TIME = 2**22
+
+MOST_DIGITS = 100
+"""Most digits of a number of an event."""
 
 
 def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
@@ -114,7 +118,7 @@ def _read_camera(path: Path, width: int, height: int) -> Camera:
 
 def _first_event_time(path: Path) -> int:
     with reading(path, f"a file of events ({EVENT_COLUMNS})"), open(path, "rb") as file:
-        line = file.readline().removeprefix(BOM_UTF8)
+        line = file.readline(LONGEST_LINE).removeprefix(BOM_UTF8)
     if not line.strip():
         raise RecordingError(f"{path} is empty; events ({EVENT_COLUMNS}) were expected.")
     columns = tuple(np.empty(1, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
@@ -126,15 +130,18 @@ def _first_event_time(path: Path) -> int:
 def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
     """Yields the events in the first `num_bytes` bytes of the file, times in nanoseconds from `zero`."""
     text = np.memmap(path, np.uint8, mode="r")[:num_bytes]
-    end = len(text)
-    while end and text[end - 1] in b" \t\r\n":
-        end -= 1
+    end = _end_of_lines(text)
     start = len(BOM_UTF8) if text[: len(BOM_UTF8)].tobytes() == BOM_UTF8 else 0
     parse, num_events = compiled(_parse_lines), 0
     while start < end:
         stop = min(start + BYTES_AT_A_TIME, end)
-        while stop < end and text[stop - 1] != ord("\n"):
-            stop += 1
+        rest, is_whole, _ = text[stop : min(stop + LONGEST_LINE, end)].tobytes().partition(b"\n")
+        if len(rest) == LONGEST_LINE:
+            line = num_events + np.count_nonzero(text[start:stop] == ord("\n")) + 1
+            raise RecordingError(
+                f"{path}, line {line} has more than {LONGEST_LINE:,} letters, but {EVENT_COLUMNS} was expected."
+            )
+        stop += len(rest) + len(is_whole)
         piece = np.asarray(text[start:stop])
         num_lines = np.count_nonzero(piece == ord("\n")) + (piece[-1] != ord("\n"))
         t, x, y, p = (np.empty(num_lines, dtype) for dtype in (np.int64, np.int32, np.int32, np.int32))
@@ -147,6 +154,17 @@ def _stream_events(path: Path, num_bytes: int, zero: int) -> Iterator[Events]:
         start = stop
 
 
+def _end_of_lines(text: Shaped[np.ndarray, " bytes"]) -> int:
+    """Returns the number of bytes without the white space at the end."""
+    end = len(text)
+    while end:
+        last = text[max(end - BYTES_AT_A_TIME, 0) : end].tobytes()
+        if kept := last.rstrip(b" \t\r\n"):
+            return end - len(last) + len(kept)
+        end -= len(last)
+    return 0
+
+
 def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:
     cells = line.decode(errors="replace").split()
     if len(cells) != 4:
@@ -154,12 +172,18 @@ def _bad_line(path: Path, number: int, line: bytes) -> RecordingError:
     for cell, expected in zip(cells, ("a time in seconds", *["a whole number"] * 3), strict=True):
         try:
             value = Decimal(cell)
-            good = value.is_finite() and abs(value) < 2**31 and (expected != "a whole number" or value == int(value))
+            good = (
+                len(cell) <= MOST_DIGITS
+                and value.is_finite()
+                and abs(value) < 2**31
+                and (expected != "a whole number" or value == int(value))
+            )
         except InvalidOperation:
             good = False
         if not good:
-            return RecordingError(f"{path}, line {number} holds {cell!r} where {expected} was expected.")
-    return RecordingError(f"{path}, line {number} holds {' '.join(cells)!r}, but {EVENT_COLUMNS} was expected.")
+            return RecordingError(f"{path}, line {number} holds {shortened(cell)!r} where {expected} was expected.")
+    found = shortened(" ".join(cells))
+    return RecordingError(f"{path}, line {number} holds {found!r}, but {EVENT_COLUMNS} was expected.")
 
 
 def _parse_lines(text, t, x, y, p):
@@ -181,6 +205,8 @@ def _parse_lines(text, t, x, y, p):
             while i < len(text):
                 if 48 <= text[i] <= 57:
                     num_digits += 1
+                    if num_digits > MOST_DIGITS:
+                        return row
                     if significant < 19:
                         mantissa = mantissa * np.uint64(10) + np.uint64(text[i] - 48)
                         significant += mantissa > 0

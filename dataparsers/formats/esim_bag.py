@@ -41,6 +41,9 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("esim.bag", "esim.conf")
 
+MAGIC = b"#ROSBAG V2.0\n"
+"""First line of a bag. rosbags reads a line of any length before it compares it."""
+
 EVENTS, POSES, CAMERA = "/cam0/events", "/cam0/pose", "/cam0/camera_info"
 
 MESSAGE_TYPES = {
@@ -118,6 +121,9 @@ def _messages(path: Path, topic: str) -> Iterator[Any]:
         raise RecordingError(
             f"{path} is a ROS bag, for which the package rosbags is missing; pip install 'enerf-ns[bag]'."
         ) from error
+    with reading(path, "a ROS 1 bag"), open(path, "rb") as file:
+        if b"\n" not in (start := file.read(len(MAGIC))) or start[:9] != MAGIC[:9]:
+            raise ValueError(f"it does not begin with {MAGIC[:-1].decode()}")
     store = get_typestore(Stores.ROS1_NOETIC)
     with reading(path, "a ROS 1 bag"), Reader(path) as bag:
         connections = [connection for connection in bag.connections if connection.topic == topic]

@@ -39,7 +39,7 @@ from enerf_ns.dataparsers.formats.robust_enerf import (
 )
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import of_file, reading
+from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, check_npy_header, of_file, reading
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -93,6 +93,9 @@ class _StoredArray:
         version = np.lib.format.read_magic(self._stream)
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"the array {name} is of version {version} of the format")
+        self._stream.seek(0)
+        check_npy_header(self._stream)
+        np.lib.format.read_magic(self._stream)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         self.shape, self.by_column, self.dtype = header(self._stream)
         if self.dtype.hasobject:
@@ -121,7 +124,13 @@ class _StoredArray:
         return self._numbers((count, *self.shape[1:]))
 
     def whole(self) -> np.ndarray:
-        """Returns the whole array."""
+        """Returns the whole array.
+
+        Raises:
+            ValueError: It has more than `LARGEST_ARRAY` bytes.
+        """
+        if (size := math.prod(self.shape) * self.dtype.itemsize) > LARGEST_ARRAY:
+            raise ValueError(f"an array has {size:,} bytes, but at most {LARGEST_ARRAY:,} were expected")
         return self._numbers(self.shape)
 
     def close(self) -> None:

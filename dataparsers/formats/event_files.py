@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import reading
+from enerf_ns.dataparsers.recording.files import LARGEST_TEXT, reading
 from enerf_ns.dataparsers.recording.recording import Events
 
 BYTES_AT_A_TIME = 2**18
@@ -308,6 +308,8 @@ def _check_aedat4(path: Path) -> None:
         with open(path, "rb") as file:
             file.seek(len(AEDAT4_MAGIC))
             (length,) = struct.unpack("<I", file.read(4))
+            if length > LARGEST_TEXT:
+                raise ValueError(f"it states a header of {length:,} bytes")
             header = file.read(length)
             (table,) = struct.unpack_from("<I", header)
             fields = table - struct.unpack_from("<i", header, table)[0]
@@ -328,7 +330,7 @@ def _check_aedat4(path: Path) -> None:
                 file.seek(place)
                 _, size = struct.unpack("<ii", file.read(8))
                 place += 8 + size
-                if size < 0 or place > end:
+                if size <= 0 or place > end:
                     raise ValueError("it is cut off")
     except (OSError, ValueError, struct.error, ElementTree.ParseError) as error:
         raise RecordingError(f"{path} is damaged ({error}); copy it again from its source.") from error

@@ -10,6 +10,7 @@ The columns lie in the group events/ or at the root. This module also reads the 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -37,6 +38,9 @@ file states fewer."""
 
 METADATA_BYTES = 2**17
 """Bytes that one addition to a file may need beside its events."""
+
+LARGEST_CHUNK = 2**27
+"""Most bytes of a chunk, which HDF5 decompresses as a whole."""
 
 SMALLEST_CACHE = 2**20
 """Least bytes of cache for decompressed chunks that are not used up."""
@@ -134,13 +138,13 @@ class Hdf5Events:
         member = _member(self.path, file, "t_offset")
         if member is None:
             return 0
-        offset = np.asarray(member)
-        if offset.dtype.kind not in "iu" or offset.size != 1:
-            raise RecordingError(
-                f"{self.path} holds t_offset as {offset.dtype} of shape {offset.shape}, but one integer (µs) was "
-                "expected."
-            )
-        return int(offset.reshape(()))
+        import h5py
+
+        if not isinstance(member, h5py.Dataset) or member.dtype.kind not in "iu" or member.size != 1:
+            found = f"{member.dtype} of shape {member.shape}" if isinstance(member, h5py.Dataset) else "no dataset"
+            raise RecordingError(f"{self.path} holds t_offset as {found}, but one integer (µs) was expected.")
+        _check_filters(self.path, member)
+        return int(np.asarray(member).reshape(()))
 
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
         """Returns the times of some events, nanoseconds from `zero`."""
@@ -217,6 +221,11 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
     import h5py
 
     properties = dataset.id.get_create_plist()
+    if dataset.chunks and (size := math.prod(dataset.chunks) * dataset.dtype.itemsize) > LARGEST_CHUNK:
+        raise RecordingError(
+            f"{path} holds {dataset.name} in chunks of {size:,} bytes, each of which is read as a whole, but at most "
+            f"{LARGEST_CHUNK:,} were expected; repack the file with smaller chunks."
+        )
     for i in range(properties.get_nfilters()):
         number, _, parameters, name = properties.get_filter(i)
         if not h5py.h5z.filter_avail(number):

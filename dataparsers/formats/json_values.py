@@ -13,11 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
-from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
 from enerf_ns.dataparsers.recording.files import of_file, read_json
-
-LONGEST = 60
-"""Most letters of a value that an error shows."""
 
 
 @dataclass(frozen=True)
@@ -178,12 +175,12 @@ def open_json(path: Path) -> Value:
 
 
 def shown(value: object) -> str:
-    """Returns a value as JSON writes it, on one line of at most `LONGEST` letters."""
+    """Returns the start of a value as JSON writes it, on one line."""
     try:
         text = json.dumps(value, default=str)
     except (TypeError, ValueError, RecursionError):  # keys that JSON has not, and circles, which YAML may hold
         text = type(value).__name__
-    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+    return shortened(text)
 
 
 def in_words(names: tuple[str, ...] | list[str]) -> str:

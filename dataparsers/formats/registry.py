@@ -17,7 +17,7 @@ from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import absolute, of_file
+from enerf_ns.dataparsers.recording.files import absolute, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
@@ -144,6 +144,7 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
                 "own poses; convert it without --poses, and give --poses with the new recording."
             )
         options["poses"] = poses
+    name_links_out(path)
     try:
         with of_file(path):
             return found.read(path, **options)

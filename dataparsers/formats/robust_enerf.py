@@ -16,7 +16,7 @@ from enerf_ns.dataparsers.formats.columns import LATEST, unit_quaternions
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, image_size, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, image_size, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.dataparsers.recording.time_units import unit_by_step
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -151,6 +151,8 @@ def read_views(folder: Path, notes: list[str]) -> Frames | None:
     path = next(
         (file for file in (views / f"transforms_{split}.json" for split in ("test", "val")) if file.exists()), None
     )
+    if views.parent != folder:
+        name_links_out(views)
     if path is None:
         notes.append(f"{views} holds neither transforms_test.json nor transforms_val.json, so no view is used.")
         return None
@@ -164,6 +166,9 @@ def read_views(folder: Path, notes: list[str]) -> Frames | None:
     if not any(files):
         notes.append(f"{path} lists {len(files)} views, but none is there as .png or .jpg, so no view is used.")
         return None
+    for entry, file in zip(entries, files, strict=True):
+        if file is not None and (".." in file.parts or not file.is_relative_to(views)):
+            raise entry["file_path"].wrong(f"a file within {views} was")
     if None in files:
         missing = entries[files.index(None)]["file_path"]
         raise missing.wrong(f"a .png or .jpg in {views} was")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from decimal import Decimal
 from pathlib import Path
 
@@ -9,9 +10,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from enerf_ns.dataparsers.formats.columns import LATEST, unit_quaternions
-from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import read_text
+from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
+from enerf_ns.dataparsers.recording.files import LARGEST_TABLE, LONGEST_LINE, reading
 from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, unit_by_step
+
+MOST_ROWS = 2_000_000
+"""Most rows of a table: those of half an hour at a thousand poses per second."""
 
 
 def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
@@ -27,20 +31,33 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
         The cells of each row, and the number of its line in the file, from 1.
 
     Raises:
-        RecordingError: The file is missing, not text, empty, or has a row with another number of columns.
+        RecordingError: The file is missing, not text, empty or too large, or has a row with another number of columns.
     """
-    lines = read_text(path, f"a text file with the columns {columns}").splitlines()
-    rows, numbers = [], []
-    for number, line in enumerate(lines, start=1):
-        cells = line.split()
-        if not cells or line.startswith("#") or (number == 1 and not any(map(_is_number, cells))):
-            continue
-        if len(cells) != len(columns.split()):
-            raise RecordingError(
-                f"{path}, line {number} has {len(cells)} columns, but {len(columns.split())} were expected: {columns}."
-            )
-        rows.append(cells)
-        numbers.append(number)
+    count = len(columns.split())
+    rows, numbers, number = [], [], 0
+    expected = f"a text file with the columns {columns}"
+    with reading(path, expected, LARGEST_TABLE), open(path, encoding="utf-8-sig") as file:
+        while line := file.readline(LONGEST_LINE + 1):
+            number += 1
+            if len(line) > LONGEST_LINE:
+                raise RecordingError(
+                    f"{path}, line {number} has more than {LONGEST_LINE:,} letters, but {count} columns were expected: "
+                    f"{columns}."
+                )
+            cells = line.split()
+            if not cells or line.startswith("#") or (number == 1 and all(_number(cell) is None for cell in cells)):
+                continue
+            if len(cells) != count:
+                raise RecordingError(
+                    f"{path}, line {number} has {len(cells)} columns, but {count} were expected: {columns}."
+                )
+            if len(rows) == MOST_ROWS:
+                raise RecordingError(
+                    f"{path} has more than {MOST_ROWS:,} rows, but a recording of at most so many poses or frames was "
+                    "expected; give a part of it."
+                )
+            rows.append(cells)
+            numbers.append(number)
     if not rows:
         raise RecordingError(f"{path} is empty; rows of the columns {columns} were expected.")
     return rows, numbers
@@ -63,7 +80,8 @@ def parse_times(
     """
     times: list[int] = []
     for cell, number in zip(cells, numbers, strict=True):
-        if not _is_number(cell) or not np.isfinite(float(cell)):
+        value = _number(cell)
+        if value is None or not math.isfinite(value):
             raise _not_a_number(path, number, cell)
         try:
             time = int((Decimal(cell) * NANOSECONDS[unit]).to_integral_value())
@@ -72,14 +90,14 @@ def parse_times(
         if abs(time) >= LATEST:
             wrong = _wrong_unit(cells, unit, kind) or "give times in this unit"
             raise RecordingError(
-                f"{path}, line {number} holds the time {cell} {unit}, which is beyond 146 years; {wrong}."
+                f"{path}, line {number} holds the time {shortened(cell)} {unit}, which is beyond 146 years; {wrong}."
             )
         if times and time <= times[-1]:
             is_rounded = Decimal(cell) > Decimal(cells[len(times) - 1])
             wrong = is_rounded and _wrong_unit(cells, unit, kind)
             raise RecordingError(
-                f"{path}, line {number} has the time {cell} {unit}, which is not after that of the row before; "
-                f"{wrong or 'times must increase from row to row'}."
+                f"{path}, line {number} has the time {shortened(cell)} {unit}, which is not after that of the row "
+                f"before; {wrong or 'times must increase from row to row'}."
             )
         times.append(time)
     return np.array(times, dtype=np.int64)
@@ -103,9 +121,10 @@ def parse_numbers(path: Path, rows: list[list[str]], numbers: list[int]) -> Floa
     values = np.empty((len(rows), len(rows[0])))
     for i, (row, number) in enumerate(zip(rows, numbers, strict=True)):
         for j, cell in enumerate(row):
-            if not _is_number(cell) or not np.isfinite(float(cell)):
+            value = _number(cell)
+            if value is None or not math.isfinite(value):
                 raise _not_a_number(path, number, cell)
-            values[i, j] = float(cell)
+            values[i, j] = value
     return values
 
 
@@ -143,14 +162,14 @@ def read_poses(
     return times, positions, quaternions
 
 
-def _is_number(cell: str) -> bool:
-    """Returns whether a text is a number in ASCII without underscores, which Python's `float` would allow."""
+def _number(cell: str) -> float | None:
+    """Returns the number that a text states, or None if it is none in ASCII without underscores, as Python allows."""
     try:
-        float(cell)
+        value = float(cell)
     except ValueError:
-        return False
-    return cell.isascii() and "_" not in cell
+        return None
+    return value if cell.isascii() and "_" not in cell else None
 
 
 def _not_a_number(path: Path, number: int, cell: str) -> RecordingError:
-    return RecordingError(f"{path}, line {number} holds {cell!r} where a finite number was expected.")
+    return RecordingError(f"{path}, line {number} holds {shortened(cell)!r} where a finite number was expected.")

@@ -13,6 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+LONGEST_SHOWN = 60
+"""Most letters of a value in a file that an error shows."""
+
 
 class UserError(Exception):
     """An error that the user can correct."""
@@ -70,6 +73,11 @@ def quoted(path: Path) -> str:
         if not letter.isprintable():
             letters[letter] = "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))
     return "$'" + "".join(letters.get(letter, letter) for letter in text) + "'"
+
+
+def shortened(text: str) -> str:
+    """Returns the start of a text, at most `LONGEST_SHOWN` letters of it."""
+    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
 
 
 def printable(text: str) -> str:

@@ -6,11 +6,12 @@ import json
 import os
 import platform
 import shutil
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,31 @@ import psutil
 from jaxtyping import Float, Float32, Shaped, UInt8
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, UserError
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, UserError, printable
+
+LARGEST_TEXT = 2**24
+"""Most bytes of a file of settings or calibrations: JSON, YAML or flags."""
+
+LARGEST_TABLE = 2**28
+"""Most bytes of a table of poses or stamps."""
+
+LARGEST_ARRAY = 2**27
+"""Most bytes of an array that is read as a whole."""
+
+LARGEST_PICTURE = 2**29
+"""Most bytes of a file of a picture."""
+
+LONGEST_LINE = 4096
+"""Most letters of a line of a table, or of a value in YAML."""
+
+LONGEST_NPY_HEADER = 2**16
+"""Most bytes of the header of an array."""
+
+MOST_PLACES = 8
+"""Most folders that links lead to and that are named."""
+
+KERNEL_FOLDERS = (Path("/proc"), Path("/sys"))
+"""Folders of files whose content the kernel makes. They are regular by their mode, and some never end."""
 
 OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
 """Colour spaces of images that are not those of a camera's pixels."""
@@ -74,19 +99,31 @@ def of_file(path: Path | str) -> Iterator[None]:
         raise RecordingError(f"{path} holds {str(error).rstrip('.')}.") from error
 
 
-def check_is_file(path: Path, expected: str) -> None:
-    """Checks that a path is a regular file or missing. Opening a pipe or a device could wait for ever.
+def check_is_file(path: Path, expected: str, largest: int | None = None) -> None:
+    """Checks that a path is a regular file or missing. Reading anything else could wait for ever or never end.
 
     Args:
         path: The path; links are followed.
         expected: The expected content, such as "an HDF5 file with events".
+        largest: Most bytes of a file whose whole content is read. None for files that are read in pieces.
 
     Raises:
-        RecordingError: A folder, pipe, device or socket.
+        RecordingError: A folder, pipe, device, socket, file of the kernel, or larger file.
     """
-    if path.exists() and not path.is_file():
-        what = "a folder" if path.is_dir() else "no regular file (but a pipe, a device or a socket)"
-        raise RecordingError(f"{path} is {what}; {expected} was expected there.")
+    if not path.exists():
+        return
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder; {expected} was expected there.")
+    place = path.resolve()
+    if not path.is_file() or any(place.is_relative_to(folder) for folder in KERNEL_FOLDERS):
+        raise RecordingError(
+            f"{path} is no regular file (but a pipe, a device, a socket or a file of the kernel); {expected} was "
+            "expected there."
+        )
+    if largest is not None and (size := path.stat().st_size) > largest:
+        raise RecordingError(
+            f"{path} has {size:,} bytes, but {expected} of at most {largest:,} bytes was expected; give that file."
+        )
 
 
 def check_is_folder(path: Path, expected: str) -> None:
@@ -103,19 +140,46 @@ def check_is_folder(path: Path, expected: str) -> None:
         raise RecordingError(f"{path} is no folder, but {expected} was expected there; rename it, or give its content.")
 
 
+def name_links_out(folder: Path) -> None:
+    """Prints one line that names the links of a folder that lead out of it, and what they lead to.
+
+    Links are followed when a recording is read, since large files are often linked. Whoever gets a recording from
+    somebody else sees so which other files of the disk it reads, before anything is copied.
+
+    Args:
+        folder: The folder of a recording, without links in its path.
+    """
+    leading: dict[Path, list[str]] = defaultdict(list)
+    for place, folders, files in os.walk(folder):
+        for link in (Path(place, name) for name in (*folders, *files)):
+            with suppress(OSError, RuntimeError):  # a link that leads nowhere or in a circle, as its reader will say
+                if link.is_symlink() and not (target := link.resolve(strict=True)).is_relative_to(folder):
+                    leading[target.parent].append(f"{link.relative_to(folder)} to {target}")
+    if not leading:
+        return
+    rarest = sorted(leading.items(), key=lambda item: len(item[1]))
+    shown = [
+        f"{links[0]}" + (f" and {len(links) - 1:,} more to {place}" if len(links) > 1 else "")
+        for place, links in rarest[:MOST_PLACES]
+    ]
+    left = f", and to {len(rarest) - MOST_PLACES:,} more folders" if len(rarest) > MOST_PLACES else ""
+    print(printable(f"Links of {folder} lead out of it: {', '.join(shown)}{left}. They are read as parts of it."))
+
+
 @contextmanager
-def reading(path: Path, expected: str) -> Iterator[None]:
+def reading(path: Path, expected: str, largest: int | None = None) -> Iterator[None]:
     """Turns any error of a library about a damaged file into one sentence.
 
     Args:
         path: The file.
         expected: The expected content, such as "an HDF5 file with events".
+        largest: Argument of `check_is_file`.
 
     Raises:
-        RecordingError: The block raised an error, or the file is missing.
+        RecordingError: The block raised an error, or the file is missing, is no regular file or is too large.
     """
     try:
-        check_is_file(path, expected)
+        check_is_file(path, expected, largest)
         yield
     except UserError:
         raise
@@ -145,17 +209,18 @@ def _check_can_be_read(path: Path, expected: str) -> None:
         raise RecordingError(f"{path} is empty; {expected} was expected.")
 
 
-def read_text(path: Path, expected: str) -> str:
+def read_text(path: Path, expected: str, largest: int = LARGEST_TEXT) -> str:
     """Returns the text of a file, UTF-8 with or without a byte-order mark.
 
     Args:
         path: The file.
         expected: The expected content, such as "JSON".
+        largest: Most bytes of the file.
 
     Raises:
-        RecordingError: The file is missing, cannot be read, or is not text.
+        RecordingError: The file is missing, cannot be read, is too large, or is not text.
     """
-    with reading(path, expected):
+    with reading(path, expected, largest):
         return path.read_text(encoding="utf-8-sig")
 
 
@@ -168,7 +233,7 @@ def load_image(path: Path) -> Shaped[np.ndarray, "height width channels"]:
         RecordingError: The file is missing or cannot be decoded, is shown turned or mirrored, is neither grey nor RGB,
             holds several pictures, or holds values of another type, below 0 or not finite.
     """
-    with reading(path, "an image"):
+    with reading(path, "an image", LARGEST_PICTURE):
         if is_deep(path):
             return _load_deep(path)
         with Image.open(path) as image:
@@ -191,7 +256,7 @@ def is_deep(path: Path) -> bool:
     Raises:
         RecordingError: The file is missing.
     """
-    with reading(path, "an image"):
+    with reading(path, "an image", LARGEST_PICTURE):
         try:
             with Image.open(path) as image:
                 decoder = image.tile[0][3] if image.tile else ""
@@ -276,7 +341,7 @@ def image_size(path: Path) -> tuple[int, int]:
         RecordingError: The file is missing or is not an image, is shown turned or mirrored, is neither grey nor RGB, or
             holds several pictures.
     """
-    with reading(path, "an image"):
+    with reading(path, "an image", LARGEST_PICTURE):
         try:
             with Image.open(path) as image:
                 _check_is_plain(path, image)
@@ -296,7 +361,9 @@ def load_array(path: Path, mmap_mode: str | None = None) -> Float[np.ndarray, ".
     Raises:
         RecordingError: The file is missing, or holds no such array.
     """
-    with reading(path, "a NumPy array (.npy)"):
+    with reading(path, "a NumPy array (.npy)", LARGEST_ARRAY if mmap_mode is None else None):
+        with open(path, "rb") as file:
+            check_npy_header(file)
         array = np.load(path, mmap_mode=mmap_mode)  # type: ignore[arg-type]
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
         raise RecordingError(f"{path} holds no array of numbers, but a .npy file of numbers was expected.")
@@ -319,6 +386,19 @@ def load_depth(path: Path) -> Float32[np.ndarray, "height width"]:
     return depth
 
 
+def check_npy_header(file: IO[bytes]) -> None:
+    """Checks the length of the header with which a .npy file begins. NumPy reads it as a whole before it checks it.
+
+    Raises:
+        ValueError: The header is longer than `LONGEST_NPY_HEADER`.
+    """
+    start = file.read(12)
+    file.seek(0)
+    length = int.from_bytes(start[8:12], "little")
+    if start[:6] == np.lib.format.MAGIC_PREFIX and start[6:7] != b"\1" and length > LONGEST_NPY_HEADER:
+        raise ValueError(f"its header states a length of {length:,} bytes")
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Returns the JSON object of a file, with or without a byte-order mark.
 
@@ -326,9 +406,33 @@ def read_json(path: Path) -> dict[str, Any]:
         RecordingError: The file is missing or holds no JSON object.
     """
     with reading(path, "JSON"):
-        value = json.loads(read_text(path, "JSON"))
+        value = parse_json(path, read_text(path, "JSON"))
     if not isinstance(value, dict):
         raise RecordingError(f"{path} holds a {type(value).__name__}, but a JSON object was expected.")
+    return value
+
+
+def parse_json(path: Path, text: str) -> Any:
+    """Returns the value of JSON.
+
+    Args:
+        path: The file that the text is of.
+        text: JSON.
+
+    Raises:
+        ValueError: The text is no JSON. It is a RecordingError if a value holds half of a letter of UTF-16, such as
+            "\\ud83d", since no file can hold it.
+    """
+    value = json.loads(text)
+    if "\\ud" in text.lower():
+        try:
+            json.dumps(value, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            found = printable(error.object[error.start : error.start + 1])
+            near = printable(error.object[max(0, error.start - 20) : error.start])
+            raise RecordingError(
+                f"{path} holds {found}, which is half of a letter, after {near!r}; write the letter itself, in UTF-8."
+            ) from error
     return value
 
 

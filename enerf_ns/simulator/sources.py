@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.text_tables import read_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import image_size, load_image
+from enerf_ns.dataparsers.recording.files import check_is_file, image_size, load_image
 from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -218,8 +218,9 @@ class Video(Pictures):
         gamma: bool = True,
         response: Response = Logarithm(),  # noqa: B008, since it cannot be changed
     ):
-        if not path.is_file():
-            raise RecordingError(f"{path} is no file, but a video was expected.")
+        check_is_file(path, "a video")
+        if not path.exists():
+            raise RecordingError(f"{path} is missing; a video was expected.")
         self.path, self._lock = path, Lock()
         self._open()
         rate = self._capture.get(cv2.CAP_PROP_FPS) if frames_per_second is None else frames_per_second

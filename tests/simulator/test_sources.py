@@ -244,7 +244,7 @@ def test_a_video_is_decoded_once_where_its_frames_are_asked_for_nearly_in_order(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (Path.unlink, r"a\.avi is no file"),
+        (Path.unlink, r"a\.avi is missing"),
         (lambda path: path.write_bytes(b""), r"a\.avi cannot be decoded as a video"),
         (lambda path: path.write_bytes(b"no video" * 100), r"a\.avi cannot be decoded as a video"),
         (lambda path: write_video(path, 1), r"a\.avi should hold 2 frames or more, but only 1 can be decoded"),

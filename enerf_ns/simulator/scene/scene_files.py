@@ -1,8 +1,7 @@
 """Scenes from files: a mesh file, or a scene file in JSON that puts parts together.
 
-A mesh file may be of any format that trimesh loads: glTF (.glb, .gltf), .obj with .mtl, .ply, .stl, .off, .dae, .3mf
-and others; trimesh needs further packages for some of them. All meshes of the file are taken, each where the file's
-scene graph places it. Units are metres, and z is up. In glTF y is up by definition, so y is turned to z.
+A mesh file is glTF (.glb, .gltf), .obj with .mtl, .ply, .stl or .off. All meshes of the file are taken, each where the
+file's scene graph places it. Units are metres, and z is up. In glTF y is up by definition, so y is turned to z.
 
 The picture of a material (baseColorTexture, map_Kd, TextureFile) is converted from sRGB to linear brightness and
 stretched to a square of a power of two of at most 2048 texels. It repeats outside of [0, 1]. In glTF it is multiplied
@@ -65,7 +64,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -80,10 +78,19 @@ from scipy.spatial.transform import Rotation
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 
+from enerf_ns.dataparsers.formats.columns import FARTHEST
 from enerf_ns.dataparsers.recording.errors import RecordingError, UserError
-from enerf_ns.dataparsers.recording.files import load_image, read_json
+from enerf_ns.dataparsers.recording.files import (
+    LARGEST_PICTURE,
+    check_is_file,
+    image_size,
+    load_image,
+    read_json,
+    reading,
+)
 from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.simulator.scene import textures
+from enerf_ns.simulator.scene.gltf import MOST_TRIANGLES, check_gltf
 from enerf_ns.simulator.scene.scenes import (
     LIGHT,
     Scene,
@@ -100,19 +107,27 @@ from enerf_ns.simulator.trajectories import SMALLEST_DISTANCE, STEEPEST_LOOK
 LARGEST_TEXTURE = 2048
 """Most texels along one side of a texture from a picture. It is halved, once or more, for more than eight pictures."""
 
+MOST_TEXELS = 2**26
+"""Most pixels of a picture that becomes a texture."""
+
 SHAPES = {"box": 3, "ball": 1, "plane": 2}
 """Count of numbers in the size of each shape that needs no file."""
 
+EXPECTED = "the file of a mesh"
+
 GREY = 0.8
 """Linear brightness of a mesh that has neither a picture nor colours."""
+
+MESHES = ("glb", "gltf", "obj", "ply", "stl", "off")
+"""Suffixes of mesh files. trimesh loads others, but archives and XML may unpack to any size and repeat parts."""
 
 IMAGES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".tga", ".gif"}
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Pose that turns the axes of glTF, whose y is up, to axes whose z is up."""
 
-GLTF_FLOAT, GLTF_FAN = 5126, 6
-"""Component type of floating point numbers, and mode of a fan of triangles, in glTF."""
+LARGEST_MESH = 2**28
+"""Most bytes of the file of a mesh, and of each file that it names but pictures."""
 
 
 def load_scene(path: Path, rng: np.random.Generator, notes: list[str]) -> Scene:
@@ -181,35 +196,35 @@ def read_mesh(path: Path, notes: list[str]) -> list[Piece]:
     Raises:
         RecordingError: The file, or a file that it names, is missing or cannot be read, or there are no faces.
     """
-    if not path.is_file():
-        raise RecordingError(
-            f"{path} is {'a folder' if path.is_dir() else 'missing'}; the file of a mesh was expected."
-        )
+    check_is_file(path, EXPECTED, LARGEST_MESH)
+    if not path.exists():
+        raise RecordingError(f"{path} is missing; {EXPECTED} was expected.")
     kind = path.suffix.lower().lstrip(".")
-    if kind not in trimesh.available_formats():
+    if kind not in MESHES:
         raise RecordingError(
-            f"{path} is of a type that trimesh does not load with the packages that are installed; give a .glb, .gltf, "
-            ".obj, .ply, .stl or .off file, or a scene file (.json)."
+            f"{path} is of a type that is not read; give a .glb, .gltf, .obj, .ply, .stl or .off file, or a scene file "
+            "(.json)."
         )
     is_gltf = kind in ("glb", "gltf")
-    expected = _check_gltf(path, notes) if is_gltf else 0
     files, pieces = _Files(path), []
     try:
+        expected = check_gltf(path, files.size_of, notes) if is_gltf else 0
         with _without_warnings():
             graph: Any = trimesh.load(str(path), resolver=files, process=False, force="scene")
-            if not files.fault:
+            if files.fault is None:
                 pieces = _pieces(path, graph, is_gltf, expected, notes)
     except UserError:
-        raise
+        if files.fault is None:
+            raise
     except ImportError as error:
         raise RecordingError(f"{path} needs a package that is not installed: {_in_one_line(error)}.") from error
     except Exception as error:  # of any kind: trimesh raises other ones for damaged files of each format
-        if not files.fault:
+        if files.fault is None:
             raise RecordingError(
-                f"{path} cannot be read as a mesh ({_in_one_line(error)}); copy it in full or export it again."
+                f"{path} cannot be read as a mesh ({_reason(error)}); copy it in full or export it again."
             ) from error
-    if files.fault:
-        raise RecordingError(f"{path} names {files.fault}; put it there or take its name out of {path.name}.")
+    if files.fault is not None:
+        raise files.fault
     if not pieces:
         raise RecordingError(f"{path} holds no mesh with faces; give one with at least one triangle.")
     total = sum(len(piece.triangles) for piece in pieces)
@@ -251,81 +266,43 @@ class _Files(FilePathResolver):
 
     def __init__(self, path: Path):
         super().__init__(str(path))
-        self.folder = path.parent
-        self.fault = ""
-        """The first file that is missing or cannot be read as an image; empty if there is none."""
+        self.path, self.folder = path, path.parent
+        self.fault: RecordingError | None = None
+        """The error of the first file that is missing, or cannot be read."""
 
     def get(self, name: str) -> bytes:
         name = name.strip().replace("\\", "/")
         for place in (self.folder / name, self.folder / unquote(name), self.folder / Path(name).name):
-            if place.is_file():
-                content = place.read_bytes()
-                if place.suffix.lower() in IMAGES:
-                    self._check_image(place, content)
+            if place.exists():
+                is_image = place.suffix.lower() in IMAGES
+                expected = "an image" if is_image else "a part of a mesh"
+                try:
+                    with reading(place, expected, LARGEST_PICTURE if is_image else LARGEST_MESH):
+                        content = place.read_bytes()
+                    if is_image:
+                        self._check_image(place, content)
+                except RecordingError as error:
+                    self.fault = self.fault or error
+                    raise
                 return content
-        self.fault = self.fault or f"{name}, which is not in {self.folder}"
+        self.fault = self.fault or self._naming(f"{name}, which is not in {self.folder}")
         raise FileNotFoundError(name)
+
+    def size_of(self, name: str) -> int:
+        """The number of bytes of a file; 0 if it is missing, which is remembered."""
+        try:
+            return len(self.get(name))
+        except (FileNotFoundError, RecordingError):
+            return 0
 
     def _check_image(self, place: Path, content: bytes) -> None:
         try:
             Image.open(BytesIO(content)).load()
-        except Exception:  # of any kind: Pillow raises other ones for damaged files of each format
-            self.fault = self.fault or f"{place}, which cannot be read as an image"
-            raise
+        except Exception as error:  # of any kind: Pillow raises other ones for damaged files of each format
+            raise self._naming(f"{place}, which cannot be read as an image") from error
 
-
-def _check_gltf(path: Path, notes: list[str]) -> int:
-    """Refuses glTF files that trimesh reads wrongly without an error, and returns how many pictures the triangles have.
-
-    trimesh 5.2 takes the integers of quantised and sparse arrays for coordinates, ignores required extensions, and
-    leaves out pictures that it cannot decode.
-    """
-    try:
-        with path.open("rb") as file:
-            start = file.read(20)
-            is_binary = start[:4] == b"glTF"
-            text = file.read(int.from_bytes(start[12:16], "little")) if is_binary else start + file.read()
-        header = json.loads(text)
-        required = [name for name in header.get("extensionsRequired", []) if not _is_read(name)]
-        primitives = [primitive for mesh in header.get("meshes", []) for primitive in mesh["primitives"]]
-        used = {primitive["attributes"].get(name) for primitive in primitives for name in ("POSITION", "TEXCOORD_0")}
-        accessors = [header["accessors"][index] for index in used - {None}]
-        coded = any("sparse" in accessor or accessor["componentType"] != GLTF_FLOAT for accessor in accessors)
-        fans = any(primitive.get("mode") == GLTF_FAN for primitive in primitives)
-        shown = {primitive["material"] for primitive in primitives if "material" in primitive}
-        materials = [header["materials"][index].get("pbrMetallicRoughness", {}) for index in shown]
-        pictures = [material["baseColorTexture"] for material in materials if "baseColorTexture" in material]
-        moved = any(
-            picture.get("texCoord", 0) or "KHR_texture_transform" in picture.get("extensions", {})
-            for picture in pictures
-        )
-        used_textures = [header["textures"][picture["index"]] for picture in pictures]
-        sources = {json.dumps([texture.get("source"), texture.get("extensions")]) for texture in used_textures}
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        raise RecordingError(
-            f"{path} cannot be read as glTF ({type(error).__name__}: {_in_one_line(error)}); copy it in full or "
-            "export it again."
-        ) from error
-    if required:
-        raise RecordingError(f"{path} needs {', '.join(required)}, which cannot be read; export it uncompressed.")
-    if coded:
-        raise RecordingError(
-            f"{path} holds positions or texture coordinates that are sparse or not floating point, which cannot "
-            "be read; export it without quantization."
-        )
-    if fans:
-        notes.append(f"{path} holds fans of triangles, which are left out.")
-    if moved:
-        notes.append(f"{path} moves textures by KHR_texture_transform or has them at TEXCOORD_1, which is ignored.")
-    return len(sources)
-
-
-def _is_read(extension: str) -> bool:
-    """Whether trimesh reads a glTF extension, or the extension changes nothing that is simulated."""
-    if extension == "KHR_draco_mesh_compression":
-        return find_spec("DracoPy") is not None
-    harmless = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_lights_punctual", "EXT_texture_webp")
-    return extension.startswith("KHR_materials_") or extension in harmless
+    def _naming(self, what: str) -> RecordingError:
+        return RecordingError(f"{self.path} names {what}; put it there or take its name out of {self.path.name}.")
 
 
 def _pieces(path: Path, graph: trimesh.Scene, is_gltf: bool, expected: int, notes: list[str]) -> list[Piece]:
@@ -337,15 +314,28 @@ def _pieces(path: Path, graph: trimesh.Scene, is_gltf: bool, expected: int, note
     nodes = [graph.graph[node] for node in graph.graph.nodes_geometry]
     placed = [(matrix, graph.geometry[name]) for matrix, name in nodes]
     placed = [(matrix, mesh) for matrix, mesh in placed if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    for matrix, mesh in placed:
+        if (number := int(mesh.faces.max())) >= len(mesh.vertices) or (number := int(mesh.faces.min())) < 0:
+            raise RecordingError(
+                f"{path} holds a triangle at vertex {number:,} of a mesh with {len(mesh.vertices):,} vertices; copy it "
+                "in full or export it again."
+            )
+        if not np.abs(matrix).max() < FARTHEST:
+            raise RecordingError(
+                f"{path} places a mesh by a matrix that holds {matrix.flat[np.abs(matrix).argmax()]:g}, but numbers up "
+                f"to {FARTHEST:g} were expected; export it again."
+            )
     pictures = {id(picture): picture for mesh in graph.geometry.values() if (picture := _picture(mesh)) is not None}
     if len(pictures) < expected:
         raise RecordingError(
-            f"{path} has {expected} pictures as textures, of which {len(pictures)} can be read; export them as PNG or "
-            "JPEG."
+            f"{path} has {expected} pictures as textures, of which {len(pictures)} can be decoded; export them as PNG "
+            "or JPEG."
         )
     largest = LARGEST_TEXTURE
     while len(pictures) * largest**2 > 8 * LARGEST_TEXTURE**2:
         largest //= 2
+    for picture in pictures.values():
+        _check_texels(path, *picture.size)
     images = {key: linear_image(_pixels(picture), largest) for key, picture in pictures.items()}
     pieces, untextured = [], Counter[str]()
     for matrix, mesh in placed:
@@ -403,6 +393,15 @@ def _picture(mesh: Any) -> Image.Image | None:
     """Picture of the material of a mesh, if it has one."""
     material = getattr(getattr(mesh, "visual", None), "material", None)
     return getattr(material, "baseColorTexture", getattr(material, "image", None))
+
+
+def _check_texels(path: Path, width: int, height: int) -> None:
+    """Refuses a picture that takes gigabytes as linear brightness."""
+    if width * height > MOST_TEXELS:
+        raise RecordingError(
+            f"{path} has a texture of {width:,} x {height:,} pixels, but at most {MOST_TEXELS:,} were expected; make "
+            "it smaller."
+        )
 
 
 def _pixels(picture: Image.Image) -> UInt8[np.ndarray, "height width channels"]:
@@ -508,12 +507,17 @@ def _read_scene_file(path: Path, rng: np.random.Generator, notes: list[str]) -> 
         if not light.any():
             raise RecordingError(f"{path} holds light = [0, 0, 0], which is no direction; write null for no light.")
         light = light / np.linalg.norm(light)
-    library = _Library(path.parent, rng)
-    pieces = [
-        piece
-        for number, part in enumerate(parts, 1)
-        for piece in _read_part(path.parent, part, f"{path}, part {number},", library, notes)
-    ]
+    library, pieces, triangles, shapes = _Library(path.parent, rng), [], 0, {}
+    for number, part in enumerate(parts, 1):
+        read = _read_part(path.parent, part, f"{path}, part {number},", library, notes)
+        shapes[part["shape"]] = sum(len(piece.triangles) for piece in read)
+        triangles += shapes[part["shape"]]
+        if triangles > max(MOST_TRIANGLES, sum(shapes.values())):
+            raise RecordingError(
+                f"{path} holds more than {MOST_TRIANGLES:,} triangles up to part {number}, by repeating shapes; leave "
+                "parts out."
+            )
+        pieces += read
     return _assemble(path, [_surface(piece, light) for piece in pieces], about)
 
 
@@ -584,6 +588,7 @@ def _shape(shape: str, size: np.ndarray) -> Piece:
 
 def _picture_of(file: Path) -> Shaped[np.ndarray, "height width channels"]:
     """The image of a file: uint8, or float32 in [0, 1] if the file has more than 8 bits."""
+    _check_texels(file, *image_size(file))
     image = load_image(file)
     return image if image.dtype == np.uint8 else image / np.float32(find_white_level((file,)))
 
@@ -696,6 +701,16 @@ def _shown(value: Any) -> str:
     """A value as JSON, cut after 80 characters."""
     text = json.dumps(value)
     return text if len(text) < 80 else f"{text[:80]} ..."
+
+
+def _reason(error: Exception) -> str:
+    """The fault of a mesh, in place of an error about arrays by which trimesh stumbles on it."""
+    if isinstance(error, IndexError):
+        return "it names a part that it does not hold"
+    text = _in_one_line(error)
+    if re.search("array|matmul|unpack|index|object|attribute|argument|sequence|Error$", text):
+        return "some of its rows or values are not of the form that they should have"
+    return text
 
 
 def _in_one_line(error: BaseException) -> str:

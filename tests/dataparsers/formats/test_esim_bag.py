@@ -277,7 +277,7 @@ def too_many_events(folder: Path) -> None:
 BAD_INPUT = {
     "no bag": (lambda folder: (folder / "esim.bag").unlink(), "esim.bag is missing; a ROS 1 bag was expected there"),
     "empty": (write("esim.bag", ""), "esim.bag is empty; a ROS 1 bag was expected"),
-    "no bag in it": (write("esim.bag", "hello\n"), "esim.bag cannot be read as a ROS 1 bag (File magic is invalid)"),
+    "no bag in it": (write("esim.bag", "hello\n"), "esim.bag cannot be read as a ROS 1 bag (it does not begin with"),
     "cut in the middle": (cut(0.5), "esim.bag cannot be read as a ROS 1 bag (Bag index looks damaged"),
     "cut near its end": (cut(0.99), "esim.bag cannot be read as a ROS 1 bag (Bag index looks damaged"),
     "cut at its beginning": (cut(0.001), "esim.bag cannot be read as a ROS 1 bag"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import test_esim_npz
 from recordings import write_davis
 from test_bad_input import is_one_sentence, read_all
 from test_fuzz import LAYOUTS, write_eds, write_tum_vie
@@ -147,4 +149,69 @@ def test_lists_of_images_stay_within_the_folder(place: str, tmp_path: Path):
     (folder / "images.txt").write_text("\n".join(images) + "\n")
     with pytest.raises(RecordingError, match=r"line 1 lists .* which lies outside") as error:
         read_all(folder, "davis")
+    assert is_one_sentence(str(error.value))
+
+
+def linked(path: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(path, place)
+    path.symlink_to(place)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_links_that_lead_out_are_followed_and_named_in_one_line(
+    layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Whatever the format, and whichever of its files is linked."""
+    LAYOUTS[layout].write(tmp_path / "whole")
+    files = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file())
+    for number, file in enumerate(files):
+        folder = tmp_path / str(number) / "recording"
+        shutil.copytree(tmp_path / "whole", folder)
+        linked(folder / file, tmp_path / "elsewhere" / file)
+        read_all(folder, LAYOUTS[layout].format)
+        printed = capsys.readouterr().out
+        assert f"Links of {folder} lead out of it: {file} to {tmp_path / 'elsewhere' / file}. They" in printed
+        assert printed.count("\n") == 1
+        shutil.rmtree(folder)
+
+
+def test_links_within_a_recording_and_its_own_link_are_not_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = write_davis(tmp_path / "recording")
+    linked(folder / "events.txt", folder / "large/events.txt")
+    (folder / "nowhere").symlink_to("none")
+    (tmp_path / "link").symlink_to(folder)
+    read_all(tmp_path / "link", "davis")
+    assert capsys.readouterr().out == ""
+
+
+def test_linked_folders_and_many_links_are_named_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = write_davis(tmp_path / "recording")
+    linked(folder / "images", tmp_path / "pictures")
+    secret(tmp_path)
+    (folder / "a secret").symlink_to(tmp_path / "secret")
+    for number in range(1000):
+        (tmp_path / "depth").mkdir(exist_ok=True)
+        (tmp_path / f"depth/{number}.npy").touch()
+        (folder / f"{number}.npy").symlink_to(tmp_path / f"depth/{number}.npy")
+    read_all(folder, "davis")
+    (line,) = capsys.readouterr().out.splitlines()
+    assert f"to {tmp_path}/pictures" in line or f"to {tmp_path}/secret" in line
+    assert f"and 999 more to {tmp_path}/depth" in line and len(line) < 600
+
+
+@pytest.mark.parametrize("place", ["../elsewhere/frame", "/{}/elsewhere/frame.png"])
+def test_lists_of_views_stay_within_the_folder(place: str, tmp_path: Path):
+    folder = tmp_path / "recording"
+    test_esim_npz.write_views(test_esim_npz.write_npz(folder) / "views")
+    path = folder / "views/transforms_test.json"
+    about = json.loads(path.read_text())
+    (tmp_path / "recording/elsewhere").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    for elsewhere in (folder / "elsewhere", tmp_path / "elsewhere"):
+        shutil.copy(next((folder / "views").rglob("*.png")), elsewhere / "frame.png")
+    about["frames"][1]["file_path"] = place.format(tmp_path)
+    path.write_text(json.dumps(about))
+    with pytest.raises(RecordingError, match=r"frames\[1\]\.file_path = .*within .* was expected") as error:
+        read_all(folder, "esim_npz")
     assert is_one_sentence(str(error.value))

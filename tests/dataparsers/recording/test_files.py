@@ -190,6 +190,14 @@ def test_what_is_no_json_object_is_an_error_of_one_sentence(tmp_path: Path, cont
     assert "a.json" in str(error.value) and "\n" not in str(error.value)
 
 
+def test_half_of_a_letter_is_named_and_a_whole_one_is_read(tmp_path: Path):
+    (tmp_path / "a.json").write_text(r'{"whole": "\ud83d\ude00", "response": "\ud83d"}')
+    with pytest.raises(RecordingError, match=r"a\.json holds \\ud83d, which is half of a letter, after .*response"):
+        read_json(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text(r'{"whole": "\ud83d\ude00", "\\ud83d": 1}')
+    assert read_json(tmp_path / "a.json") == {"whole": "\N{GRINNING FACE}", r"\ud83d": 1}
+
+
 def test_arrays_that_are_none(tmp_path: Path):
     np.savez(tmp_path / "a.npz", x=np.zeros(3))
     with pytest.raises(RecordingError, match="holds no array of numbers"):
