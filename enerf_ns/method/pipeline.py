@@ -24,6 +24,8 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
 from enerf_ns.evaluation.display import Display, shown_numbers
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -49,6 +51,7 @@ from enerf_ns.poses.refiner import (
     render_slopes,
 )
 from enerf_ns.quiet import silence_known_warnings
+from enerf_ns.rendering.edge_start import start_from_edges
 from enerf_ns.rendering.seen_volume import SeenVolume
 from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.terminal import say, say_where
@@ -70,6 +73,9 @@ PLACES_A_SIDE = 4
 """Columns and rows of points in a pixel over which the scores of events average brightness. Events fire while an edge
 crosses their pixel: the true scene, rendered at the centre alone, has a correlation of 0.84 to 0.87 with them, and over
 the area 0.998 (`benchmarks/instants.py`)."""
+
+FEWEST_EDGES = 500
+"""Fewest points of edges from which a field starts."""
 
 SLOPE_NS = 1_000_000
 """Time (ns) before and after an instant over which the slope of brightness is rendered."""
@@ -252,6 +258,8 @@ class EnerfPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch."""
         sensor = self.model.sensor
+        if self.training and step == 0 and self.model.config.edge_start:
+            self._start_from_edges()
         if self.training and step == LAG_TOLD_AFTER and (left_out := sensor.leave_out_small_lag()):
             say(left_out)
         batch = self.datamanager.next_batch(sensor)
@@ -271,6 +279,20 @@ class EnerfPipeline(VanillaPipeline):
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
         self.stopwatch.lap("losses")
         return outputs, losses, metrics
+
+    def _start_from_edges(self) -> None:
+        """Starts the field and the proposal network from the depth of edges, if events show enough of them."""
+        manager, camera, model = self.datamanager, self.datamanager.event_camera, self.model
+        depth_range = scene_depth_range(manager.recording, manager.config.dataparser.depth_range)
+        views = edge_depth(manager.recording, depth_range)
+        edges = [torch.from_numpy(view.points).to(self.device) for view in views]
+        places = [torch.from_numpy(view.pose[:, 3]).to(points).expand_as(points) for view, points in zip(views, edges, strict=True)]
+        ends, starts = (camera.in_scene(torch.cat(points)).float() for points in (edges, places))
+        if len(ends) < FEWEST_EDGES:
+            return
+        assert model.config.near_plane is not None
+        densities = [model.field.geometry, *([model.proposal] if model.proposal else [])]
+        start_from_edges(densities, starts, ends, model.config.near_plane)
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
         """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""
