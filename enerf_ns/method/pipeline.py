@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
@@ -282,16 +283,21 @@ class EnerfPipeline(VanillaPipeline):
 
     def _start_from_edges(self) -> None:
         """Starts the field and the proposal network from the depth of edges, if events show enough of them."""
-        manager, camera, model = self.datamanager, self.datamanager.event_camera, self.model
+        manager, model = self.datamanager, self.model
         depth_range = scene_depth_range(manager.recording, manager.config.dataparser.depth_range)
         views = edge_depth(manager.recording, depth_range)
-        edges = [torch.from_numpy(view.points).to(self.device) for view in views]
-        places = [torch.from_numpy(view.pose[:, 3]).to(points).expand_as(points) for view, points in zip(views, edges, strict=True)]
-        ends, starts = (camera.in_scene(torch.cat(points)).float() for points in (edges, places))
-        if len(ends) < FEWEST_EDGES:
+        if sum(len(view.points) for view in views) < FEWEST_EDGES:
             return
+        edges = np.concatenate([view.points for view in views])
+        places = np.concatenate([np.broadcast_to(view.pose[:, 3], view.points.shape) for view in views])
+        starts, ends = (
+            manager.event_camera.in_scene(torch.from_numpy(points).to(self.device)).float()
+            for points in (places, edges)
+        )
+        if self._viewer is not None:
+            self._viewer.draw_edges(ends)
         assert model.config.near_plane is not None
-        densities = [model.field.geometry, *([model.proposal] if model.proposal else [])]
+        densities = [density for density in (model.field.geometry, model.proposal) if density is not None]
         start_from_edges(densities, starts, ends, model.config.near_plane)
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
