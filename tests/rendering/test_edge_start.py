@@ -45,7 +45,7 @@ def test_rays_are_free_up_to_an_edge_and_end_at_it():
         before = torch.exp(-optical_depth(network, *others, 0.2, 0.9))
         at = 1.0 - torch.exp(-optical_depth(network, *others, 0.95, 1.05))
         assert before.median() > 0.8 and before.mean() > 0.75
-        assert at.median() > 0.9 and at.mean() > 0.8
+        assert at.median() > 0.85 and at.mean() > 0.8
     fresh = density()
     assert torch.exp(-optical_depth(fresh, *others, 0.2, 0.9)).median() < 0.6  # the field did not start that way
     assert torch.exp(-optical_depth(fresh, *others, 0.95, 1.05)).median() > 0.8
