@@ -25,8 +25,8 @@ BASELINE = 1.0
 EVENTS_PER_VIEW = 300_000
 """Most events of a view, evenly taken. More of them do not make depth more accurate."""
 
-MOST_EVENTS_IN_SPAN = 20_000_000
-"""Number of events, at the recording's mean rate, to which the span of time around a view is limited."""
+MOST_EVENTS = 10_000_000
+"""Most events of a recording, evenly taken, which bounds memory."""
 
 INSTANTS = 1024
 """Instants of a span at which its poses are taken."""
@@ -113,34 +113,44 @@ def edge_depth(
     instants = evenly_spaced(first, last, 4 * INSTANTS)
     path = trajectory.poses(torch.from_numpy(instants))[:, :, 3].numpy()
     apart = trajectory.in_gaps(instants)
-    longest = MOST_EVENTS_IN_SPAN / max(len(index), 1) * (index.span[1] - index.span[0])
+    events = index.events(at_most=MOST_EVENTS)
     views = []
     for time in evenly_spaced(first, last, 2 * num_views + 1)[1::2]:
-        span = _span_around(time, BASELINE / 2 * near, longest, instants, path, apart)
-        events = index.events_within(span[None])
-        if view := _view_at(time, events, recording.camera, trajectory, near, far):
+        span = np.searchsorted(events.t, _span_around(time, BASELINE / 2 * near, instants, path, apart))
+        if view := _view_at(time, events, span, recording.camera, trajectory, near, far):
             views.append(view)
     return _confirmed(views)
 
 
 def _span_around(
-    time: int, radius: float, longest: float, instants: Int64[np.ndarray, " i"], path: np.ndarray, apart: np.ndarray
+    time: int, radius: float, instants: Int64[np.ndarray, " i"], path: np.ndarray, apart: np.ndarray
 ) -> Int64[np.ndarray, " 2"]:
     """First and last instant (ns) around a time while the camera stays within a radius (metres) of its place then."""
     now = int(np.clip(np.searchsorted(instants, time), 1, len(instants) - 2))
-    left = (np.linalg.norm(path - path[now], axis=1) > radius) | apart | (2 * np.abs(instants - time) > longest)
+    left = (np.linalg.norm(path - path[now], axis=1) > radius) | apart
     return instants[stretch_around(now, left)]
 
 
 def _view_at(
-    time: int, events: Events, camera: Camera, trajectory: Trajectory, near: float, far: float
+    time: int,
+    events: Events,
+    span: Int64[np.ndarray, " 2"],
+    camera: Camera,
+    trajectory: Trajectory,
+    near: float,
+    far: float,
 ) -> EdgeView | None:
-    """The depth of all ridges with enough contrast, or None if the camera does not move."""
-    if len(events) < 2:
+    """The depth of all ridges with enough contrast, or None if the camera does not move.
+
+    Args:
+        span: Numbers of the first event that counts, and of the first after it that does not.
+    """
+    begin, end = span
+    if end - begin < 2:
         return None
-    step = -(-len(events) // EVENTS_PER_VIEW)
-    x, y, t = events.x[::step], events.y[::step], events.t[::step]
-    instants = evenly_spaced(events.t[0], events.t[-1], INSTANTS)
+    chosen = slice(begin, end, -(-(end - begin) // EVENTS_PER_VIEW))
+    x, y, t = events.x[chosen], events.y[chosen], events.t[chosen]
+    instants = evenly_spaced(t[0], t[-1], INSTANTS)
     poses = trajectory.poses(torch.from_numpy(instants)).numpy()
     pose = trajectory.poses(torch.as_tensor(time)).numpy()
     baseline = float(np.linalg.norm(np.ptp(poses[:, :, 3], axis=0)))

@@ -39,6 +39,16 @@ def proposal_network(scene: Scene) -> None:
     scene.row("proposal network", sampling == "proposal", value, scene.why(name, why), name)
 
 
+def edge_start(scene: Scene) -> None:
+    """Does the field start from the depth of edges?"""
+    name = "model.edge_start"
+    kept = scene.use(name, lambda: scene.use_events and scene.defaults.starts_from_edges)
+    why = "not part of the method" if scene.use_events else "the field learns from frames alone"
+    if scene.use_events and scene.defaults.starts_from_edges:
+        why = "events show the depth of edges before training"
+    scene.row("start from edges", bool(kept), "", scene.why(name, why), name)
+
+
 def opacity_loss(scene: Scene) -> None:
     """Does every ray meet a surface?"""
     name = "model.opacity_loss_weight"

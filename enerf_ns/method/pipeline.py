@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
@@ -24,6 +25,8 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
 from enerf_ns.evaluation.display import Display, shown_numbers
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -50,6 +53,7 @@ from enerf_ns.poses.refiner import (
     render_slopes,
 )
 from enerf_ns.quiet import silence_known_warnings
+from enerf_ns.rendering.edge_start import start_from_edges
 from enerf_ns.rendering.seen_volume import SeenVolume
 from enerf_ns.supervision.event_supervision import brightness_change
 from enerf_ns.terminal import say, say_where
@@ -71,6 +75,9 @@ PLACES_A_SIDE = 4
 """Columns and rows of points in a pixel over which the scores of events average brightness. Events fire while an edge
 crosses their pixel: the true scene, rendered at the centre alone, has a correlation of 0.84 to 0.87 with them, and over
 the area 0.998 (`benchmarks/instants.py`)."""
+
+FEWEST_EDGES = 500
+"""Fewest points of edges from which a field starts."""
 
 SLOPE_NS = 1_000_000
 """Time (ns) before and after an instant over which the slope of brightness is rendered."""
@@ -254,6 +261,8 @@ class EnerfPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of the next batch."""
         sensor = self.model.sensor
+        if self.training and step == 0 and self.model.config.edge_start:
+            self._start_from_edges()
         if self.training and step == LAG_TOLD_AFTER and (left_out := sensor.leave_out_small_lag()):
             say(left_out)
         batch = self.datamanager.next_batch(sensor)
@@ -273,6 +282,25 @@ class EnerfPipeline(VanillaPipeline):
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
         self.stopwatch.lap("losses")
         return outputs, losses, metrics
+
+    def _start_from_edges(self) -> None:
+        """Starts the field and the proposal network from the depth of edges, if events show enough of them."""
+        manager, model = self.datamanager, self.model
+        depth_range = scene_depth_range(manager.recording, manager.config.dataparser.depth_range)
+        views = edge_depth(manager.recording, depth_range)
+        if sum(len(view.points) for view in views) < FEWEST_EDGES:
+            return
+        edges = np.concatenate([view.points for view in views])
+        places = np.concatenate([np.broadcast_to(view.pose[:, 3], view.points.shape) for view in views])
+        starts, ends = (
+            manager.event_camera.in_scene(torch.from_numpy(points).to(self.device)).float()
+            for points in (places, edges)
+        )
+        if self._viewer is not None:
+            self._viewer.draw_edges(ends)
+        assert model.config.near_plane is not None
+        densities = [density for density in (model.field.geometry, model.proposal) if density is not None]
+        start_from_edges(densities, starts, ends, model.config.near_plane)
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
         """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""

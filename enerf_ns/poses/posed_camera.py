@@ -76,7 +76,7 @@ class PosedCamera:
             position = position + (rotation @ correction[..., 3:])[..., 0]
             rotation = rotation @ correction[..., :3]
         rotation = self._transform[:, :3] @ rotation
-        origins = self.scale * (position @ self._transform[:, :3].T + self._transform[:, 3])
+        origins = self.in_scene(position)
         towards, norms = self._directions[pixels], self._norms[pixels]
         if places is not None:
             right, down = self._steps
@@ -92,6 +92,10 @@ class PosedCamera:
             pixel_area=torch.full_like(origins[:, :1], area, dtype=torch.float32),
             metadata={"directions_norm": norms},
         )
+
+    def in_scene(self, points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "points 3"]:
+        """Points of the recording's world (metres), in scene units."""
+        return self.scale * (points @ self._transform[:, :3].T + self._transform[:, 3])
 
     def axes(self, times: Int64[Tensor, " rays"]) -> Float[Tensor, "rays 3 3"]:
         """Rotations from the axes of the camera at some times (ns) to the axes of the scene."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import viser
 import viser.transforms as vtf
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.render_state_machine import RenderAction
@@ -68,6 +68,12 @@ NERFSTUDIO_BACKGROUND, UNKNOWN = (38, 42, 55), (100, 100, 100)
 PAUSE = 0.1
 """Seconds after a move of a view in which training pauses."""
 
+EDGES = (120, 200, 255)
+"""Colour of the points of edges."""
+
+EDGE_WIDTH = 0.003
+"""Width of a point of an edge, as a share of the depth of the first view."""
+
 STATED = (150, 150, 150)
 """Colour of the trajectory before corrections."""
 
@@ -85,6 +91,8 @@ class SceneView(ViewerControl):
         self._seen: SeenRays | None = None
         self._seen_at = self._looked_at = 0  # training steps
         self._level = 0.0  # stops
+        self._showed_trained = False
+        self._edges: viser.PointCloudHandle | None = None
         self._moves, self._turn_to_render = threading.Lock(), threading.Lock()
 
     def _setup(self, viewer: Viewer) -> None:
@@ -119,6 +127,17 @@ class SceneView(ViewerControl):
             pass
         while viewer.render_statemachines and time.time() - viewer.last_move_time < PAUSE:
             time.sleep(0.01)
+
+    def draw_edges(self, edges: Float[Tensor, "edges 3"]) -> None:
+        """Draws points of edges, in scene units, until the first picture of the trained field, or as the panel says."""
+        self._edges = self.viser_server.scene.add_point_cloud(
+            "/edges",
+            edges.cpu().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
+            colors=EDGES,
+            point_size=EDGE_WIDTH * self._depth * VISER_NERFSTUDIO_SCALE_RATIO,
+            point_shape="circle",
+        )
+        self._shows_edges.visible = True
 
     def end(self, step: int, sentence: str) -> None:
         """Says in all browsers that training has ended, after its last step."""
@@ -210,6 +229,7 @@ class SceneView(ViewerControl):
             self._plays = gui.add_checkbox("Play", False, hint="Move along the trajectory, over and over")
             self._follows = gui.add_checkbox("Follow", True, hint="Look from where the sensor was at that moment")
             self._events = gui.add_checkbox("Events", False, hint="Draw the events of that moment on the surfaces")
+            self._shows_edges = gui.add_checkbox("Edges", True, visible=False, hint="Draw the edges that events show")
             self._window = gui.add_slider("Last (ms)", 1, 100, 1, 10, hint="Time before the moment with drawn events")
             self._stops = gui.add_slider("Brightness", -4.0, 4.0, 0.1, 0.0, hint="Stops; each doubles the brightness")
             self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
@@ -220,6 +240,7 @@ class SceneView(ViewerControl):
         """Makes the folder do what it says, from the moment that the scene is there."""
         for handle in (self._events, self._window, self._stops, self._gamma):
             handle.on_update(lambda _: self._render())
+        self._shows_edges.on_update(lambda _: self._show_edges())
         self._time.on_update(lambda _: self._move())
         self._follows.on_update(lambda _: self._move())
         self._plays.on_update(lambda _: threading.Thread(target=self._play, daemon=True).start())
@@ -320,6 +341,10 @@ class SceneView(ViewerControl):
             self._time.value = following if following <= last else first
             time.sleep(PLAY_STEP)
 
+    def _show_edges(self) -> None:
+        if self._edges is not None:
+            self._edges.visible = self._shows_edges.value
+
     def _seen_now(self) -> SeenRays:
         assert self._model.seen_volume is not None
         return SeenRays(self._model.seen_volume())
@@ -342,6 +367,8 @@ class SceneView(ViewerControl):
         if is_whole and self._manager.corrections is not self._path_of:
             self._draw_path()
             self._corrected.content = self._corrections_in_words
+        if self._edges is not None and step > 0 and not self._showed_trained:
+            self._showed_trained, self._shows_edges.value = True, False
         if self._seen is None or model.config.contraction:
             return
         nears, fars = self._seen.span(rays.origins, rays.directions)
