@@ -21,7 +21,8 @@ def density() -> HashDensity:
 def edges_on_two_walls(number: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Places of a camera that moves in the plane z = -0.9, and points of a near wall (x < 0) and of a far one."""
     generator = torch.Generator().manual_seed(1)
-    places = torch.rand(number, 3, generator=generator) * torch.tensor([0.4, 0.4, 0.0]) + torch.tensor([-0.2, -0.2, -0.9])
+    places = 0.4 * torch.rand(number, 3, generator=generator) - 0.2
+    places[:, 2] = -0.9
     points = 1.6 * torch.rand(number, 3, generator=generator) - 0.8
     points[:, 2] = torch.where(points[:, 0] < 0.0, 0.0, 0.7)
     return places, points
