@@ -50,7 +50,7 @@ def in_surroundings(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", ["20", "0", "-3", "many"])
+@pytest.mark.parametrize("columns", ["20", "many"])
 def test_terminals_of_any_kind(recording: Path, tmp_path: Path, warm_commands: WarmCommands, columns: str):
     told = in_surroundings(warm_commands, recording, tmp_path, TERM="dumb", COLUMNS=columns)
     assert "\x1b" not in told
@@ -75,7 +75,7 @@ def test_decimal_commas_of_the_locale_change_no_number(recording: Path, tmp_path
     told = []
     for name, locale in {"usual": "C", "commas": "de_DE.UTF-8"}.items():
         (tmp_path / name).mkdir()
-        environment = {"LOCPATH": str(tmp_path), "ENERF_CACHE": str(tmp_path / "cache")}
+        environment: dict[str, Any] = {"LOCPATH": str(tmp_path), "ENERF_CACHE": str(tmp_path / "cache")}
         told.append(in_surroundings(warm_commands, recording, tmp_path / name, locale=locale, **environment))
         shutil.rmtree(tmp_path / name / "recording", ignore_errors=True)
     usual, commas = ([line for line in text.splitlines() if line.startswith("step 2 of 2")] for text in told)
