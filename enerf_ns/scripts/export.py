@@ -45,6 +45,8 @@ class Export:
     recording was simulated."""
 
     def main(self) -> None:
+        from trimesh import PointCloud
+
         from enerf_ns.export.scoring import simulated_scene, surface_scores
         from enerf_ns.export.splats import encode_splats, splat_sizes
         from enerf_ns.export.surface import VOXEL_PIXELS, fused, pixel_size, points_of, surface_views
@@ -85,6 +87,7 @@ class Export:
                 "train it longer."
             )
         if self.what == "splats":
+            assert isinstance(surface, PointCloud)
             content = encode_splats(surface, splat_sizes(surface.vertices, camera, views, voxel))
         else:
             content = surface.export(file_type=output.suffix[1:])

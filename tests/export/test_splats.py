@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_other_programs_read_the_file(content: bytes, tmp_path: Path):
     import open3d
 
     (tmp_path / "splats.ply").write_bytes(content)
-    read = open3d.t.io.read_point_cloud(str(tmp_path / "splats.ply"))
+    reader: Any = open3d.t.io
+    read = reader.read_point_cloud(str(tmp_path / "splats.ply"))
     splats = parsed(content)
     np.testing.assert_allclose(read.point.positions.numpy(), np.stack([splats[axis] for axis in "xyz"], 1), atol=1e-6)
     assert np.allclose(1 / (1 + np.exp(-splats["opacity"])), OPACITY) and (splats["rot_0"] == 1).all()
