@@ -19,12 +19,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import test_bad_input
 import test_eds
 import test_esim_npz
 import test_event_files
 import test_event_recording
+import test_files
 import test_fuzz
 import test_tum_vie
 from recordings import write_davis, write_esim
@@ -170,7 +172,38 @@ def _stating(about: dict) -> Fault:
     return lambda folder: (folder / "recording.json").write_text(content)
 
 
-CASES = {**cases_of_files(), **cases_of_tables()}
+def cases_of_what_is_stated() -> dict[str, Wrong]:
+    """Pictures whose stored pixels are not what a viewer shows, depth that is none, and cameras that none is."""
+    frames = {
+        "small own": "frames/1.png",
+        "small esim": "images/00001.png",
+        "small davis": "images/frame_00000001.png",
+    }
+    cases = {}
+    for whole, place in frames.items():
+        for name, (file, write, _) in test_files.NOT_PLAIN.items():
+            if whole == "small own" or file.endswith(".png"):
+                path = Path(place).with_suffix(Path(file).suffix)
+                cases[f"{whole}: {name}"] = Wrong(whole, _instead_of(Path(place), path, write), (path.name, "expected"))
+    for whole, depth in {"small own": Path("depth/1.npy"), "small esim": Path("depth/00001.npy")}.items():
+        for value in (-1.0, np.nan, np.inf):
+            fault = _at(depth, lambda path, value=value: np.save(path, np.load(path) * value))
+            cases[f"{whole}: depth times {value}"] = Wrong(whole, fault, (depth.name, "holds a depth of"), "convert")
+    for white in (1, 65535):
+        stated = _stating({"white_level": white})
+        cases[f"small own: white {white}"] = Wrong("small own", stated, (f"white_level = {white}", "has 8 bits"))
+    for factor in (0.01, 100):
+        camera = test_event_recording.CAMERA | {"fx": factor * test_event_recording.CAMERA["fy"]}
+        stretched = _stating({"camera": camera})
+        cases[f"small own: fx {factor} fy"] = Wrong("small own", stretched, ("recording.json", "fits no lens"))
+    return cases
+
+
+def _instead_of(old: Path, new: Path, write: Callable[[Path], object]) -> Fault:
+    return lambda folder: ((folder / old).unlink(), write(folder / new))
+
+
+CASES = {**cases_of_files(), **cases_of_tables(), **cases_of_what_is_stated()}
 
 
 def tree(folder: Path) -> dict[str, object]:
