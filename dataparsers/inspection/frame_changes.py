@@ -155,7 +155,7 @@ class _Sums:
 
     def _level(self, number: int) -> Float32[np.ndarray, "rows columns"]:
         image = brightness(self.frames.image(number) if self.is_own else self.frames.picture(number))
-        return image @ np.float32(LUMA) if image.shape[2] == 3 else image[..., 0]
+        return image @ np.array(LUMA, np.float32) if image.shape[2] == 3 else image[..., 0]
 
 
 def _places(recording: EventRecording, frames: Frames, depth: float) -> Int64[np.ndarray, " pixels"]:

@@ -61,7 +61,9 @@ def turned_by(orientation: int) -> Image.Exif:
 
 def in_lab(image: Image.Image) -> Image.Image:
     profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
-    return ImageCms.applyTransform(image, ImageCms.buildTransform(*profiles, "RGB", "LAB"))
+    found = ImageCms.applyTransform(image, ImageCms.buildTransform(*profiles, "RGB", "LAB"))
+    assert found is not None
+    return found
 
 
 def pages(path: Path) -> None:
