@@ -133,8 +133,8 @@ class EnerfModelConfig(ModelConfig):
     interlevel_loss_weight: float = 1.0
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     edge_start: Optional[bool] = None  # noqa: UP045
-    """Start the field from the depth of edges that events show before training (`start_from_edges`). Default: True
-    where the field learns from events; False for enerf-paper."""
+    """Start the field from the depth of edges that events show before training. Default: True where they show it at
+    more than 5 % of the pixels; False for enerf-paper."""
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""

@@ -76,9 +76,6 @@ PLACES_A_SIDE = 4
 crosses their pixel: the true scene, rendered at the centre alone, has a correlation of 0.84 to 0.87 with them, and over
 the area 0.998 (`benchmarks/instants.py`)."""
 
-FEWEST_EDGES = 500
-"""Fewest points of edges from which a field starts."""
-
 SLOPE_NS = 1_000_000
 """Time (ns) before and after an instant over which the slope of brightness is rendered."""
 
@@ -284,11 +281,11 @@ class EnerfPipeline(VanillaPipeline):
         return outputs, losses, metrics
 
     def _start_from_edges(self) -> None:
-        """Starts the field and the proposal network from the depth of edges, if events show enough of them."""
+        """Starts the field and the proposal network from the depth of edges that events show."""
         manager, model = self.datamanager, self.model
         depth_range = scene_depth_range(manager.recording, manager.config.dataparser.depth_range)
         views = edge_depth(manager.recording, depth_range)
-        if sum(len(view.points) for view in views) < FEWEST_EDGES:
+        if not any(len(view.points) for view in views):
             return
         edges = np.concatenate([view.points for view in views])
         places = np.concatenate([np.broadcast_to(view.pose[:, 3], view.points.shape) for view in views])

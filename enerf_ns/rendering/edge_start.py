@@ -12,10 +12,10 @@ from enerf_ns.kernels.precision import full_precision
 from enerf_ns.rendering.field import HashDensity
 
 STEPS = 150
-"""Steps of the optimiser."""
+"""Steps of the optimiser. After 60, rays are not free yet: at first the loss makes all of space denser."""
 
 LEARNING_RATE = 2e-3
-"""Learning rate of Adam. With 1e-2 surfaces that are wrong stay to the end of training."""
+"""Learning rate of Adam. With 1e-2, surfaces that are wrong stay to the end of training."""
 
 RAYS = 512
 """Rays of a step."""
