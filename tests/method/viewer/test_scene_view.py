@@ -189,6 +189,18 @@ def test_pictures_are_of_the_view_small_at_once_and_whole_at_rest(
     assert correlation(shown[inner], rendered(pipeline, client).numpy()[inner]) > 0.8
 
 
+def test_edges_are_points_of_the_scene_until_they_are_hidden(pipeline: EnerfPipeline, client: Client):
+    edges = torch.tensor([[0.1, 0.2, -0.3], [0.0, -0.5, 0.25]])
+    pipeline.viewer.draw_edges(edges)
+    wait_for(lambda: client.told("PointCloudMessage"))
+    points = client.told("PointCloudMessage")[-1]["points"]
+    found = np.frombuffer(points["data"] if isinstance(points, dict) else points, np.float32).reshape(-1, 3)
+    np.testing.assert_allclose(found, VISER_SCALE * edges.numpy(), rtol=1e-6)
+    client.set("Edges", False)
+    hidden = {"name": "/edges", "visible": False}
+    wait_for(lambda: any(hidden.items() <= told.items() for told in client.told("SetSceneNodeVisibilityMessage")))
+
+
 def test_what_was_never_seen_is_squares_of_two_greys(client: Client, opened: dict[str, Any]):
     client.go(position=(300.0, 300.0, 300.0), look_at=(600.0, 600.0, 600.0))
     picture = at_rest(client).astype(float)
