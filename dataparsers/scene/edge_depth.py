@@ -122,12 +122,6 @@ def edge_depth(
     return _confirmed(views)
 
 
-def share_of_edges(views: Sequence[EdgeView]) -> float:
-    """Share of the pixels of some views, from 0 to 1, at which the depth of an edge is known; 0 without views."""
-    pixels = sum(view.depth.size for view in views)
-    return sum(np.count_nonzero(view.depth) for view in views) / pixels if pixels else 0.0
-
-
 def _span_around(
     time: int, radius: float, instants: Int64[np.ndarray, " i"], path: np.ndarray, apart: np.ndarray
 ) -> Int64[np.ndarray, " 2"]:

@@ -7,17 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from enerf_ns.choices.extent import depths
-from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import Scene, path_extent
-from enerf_ns.dataparsers.scene.edge_depth import edge_depth, share_of_edges
 from enerf_ns.events.statistics import border_rate
 
 SILENT_BORDER = 0.02
 """Share of a sensor's mean events a pixel below which its border is silent, as around an object before nothing."""
-
-SHARE_OF_EDGES = 0.05
-"""Least share of the pixels with an edge of known depth for which the field starts from edges. Between 7 and 11 %, depth
-was better or much better; at 2 %, brightness lost up to 0.2 dB (benchmarks/README.md)."""
 
 SEEN_AROUND = math.radians(30)
 """Angle (rad) over which the middle of the scene must be seen before gloss is looked for. Over a smaller angle, gloss
@@ -43,24 +37,6 @@ def proposal_network(scene: Scene) -> None:
         value = f"{model.num_samples} samples a ray, evenly spaced"
     why = f"the path moves the nearest point by {disparity:.0f} pixels against the farthest"
     scene.row("proposal network", sampling == "proposal", value, scene.why(name, why), name)
-
-
-def edge_start(scene: Scene) -> None:
-    """Does the field start from the depth of edges?"""
-    name, why = "model.edge_start", "the field learns from frames alone"
-
-    def shows_enough() -> bool:
-        nonlocal why
-        if not (scene.use_events and scene.defaults.starts_from_edges):
-            return False
-        share = share_of_edges(edge_depth(scene.once(corrected_recording), scene.once(depths)))
-        why = f"before training, events show the depth of edges at {100 * share:.2g} % of the pixels"
-        return share > SHARE_OF_EDGES
-
-    if scene.use_events:
-        why = "not part of the method"
-    kept = scene.use(name, shows_enough)
-    scene.row("start from edges", bool(kept), "", scene.why(name, why), name)
 
 
 def opacity_loss(scene: Scene) -> None:

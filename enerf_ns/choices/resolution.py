@@ -35,8 +35,6 @@ class MethodDefaults:
     """Weight of the level loss if the field learns from events alone."""
     refines_poses: bool = True
     """Whether clock, mount, lens and drift of the poses are corrected if events show that they are wrong."""
-    starts_from_edges: bool = True
-    """Whether the field starts from the depth of edges that events show before training."""
     learns_sensor: bool = True
     """Whether the method measures and learns what the recording does not state of its sensor, or assumes it."""
     whole_preset: bool = False

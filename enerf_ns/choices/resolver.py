@@ -43,7 +43,6 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     frames.exposure,
     extent.hash_grid,
     rays.proposal_network,
-    rays.edge_start,
     rays.opacity_loss,
 )
 """Rows in the order in which they are decided: each may depend on those before it."""

@@ -129,7 +129,6 @@ PAPER = MethodDefaults(
     no_event_margin=1.0,
     level_loss_weight=0.0,
     refines_poses=False,
-    starts_from_edges=False,
     learns_sensor=False,
     whole_preset=True,
 )

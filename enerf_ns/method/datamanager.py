@@ -29,6 +29,7 @@ from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.picture_depth import brightness
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, overlaps
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
 from enerf_ns.events.samplers import (
     AccumulationSampler,
@@ -172,10 +173,23 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         return self.train_dataset.recording
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        """Nearest and farthest depth of the scene, metres."""
+        return scene_depth_range(self.recording, self.config.dataparser.depth_range)
+
+    @property
     def distance(self) -> float:
         """Typical depth of the scene in metres: the geometric mean of its nearest and farthest depth."""
-        near, far = scene_depth_range(self.recording, self.config.dataparser.depth_range)
-        return math.sqrt(near * far)
+        return math.sqrt(math.prod(self.depth_range))
+
+    def edges(self) -> tuple[Float[Tensor, "edges 3"], Float[Tensor, "edges 3"]]:
+        """Places that edges were seen from, and the edges, in scene units: all whose depth `edge_depth` finds."""
+        views = edge_depth(self.recording, self.depth_range)
+        edges = [np.zeros((0, 3)), *(view.points for view in views)]
+        places = [np.zeros((0, 3)), *(np.broadcast_to(view.pose[:, 3], view.points.shape) for view in views)]
+        found = (torch.from_numpy(np.concatenate(points)).to(self.device) for points in (places, edges))
+        starts, ends = (self.event_camera.in_scene(points).float() for points in found)
+        return starts, ends
 
     @property
     def held_out_spans(self) -> Int64[np.ndarray, "spans 2"]:

@@ -132,9 +132,9 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the distortion loss of mip-NeRF 360, which contracts fog to surfaces."""
     interlevel_loss_weight: float = 1.0
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
-    edge_start: Optional[bool] = None  # noqa: UP045
-    """Start the field from the depth of edges that events show before training. Default: True where they show it at
-    more than 5 % of the pixels; False for enerf-paper."""
+    edge_start: bool = False
+    """Start from the depth of edges that events show before training. More depth is known then, and in scenes with many
+    edges it is better; pictures may be worse by up to 1 dB (benchmarks/README.md, start from edges)."""
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Type, cast  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
-import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
@@ -25,8 +24,6 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, exit_with_a_sentence
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
-from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
 from enerf_ns.evaluation.display import Display, shown_numbers
 from enerf_ns.evaluation.metrics import EVENT_SCORES, Score, event_scores
@@ -282,22 +279,15 @@ class EnerfPipeline(VanillaPipeline):
 
     def _start_from_edges(self) -> None:
         """Starts the field and the proposal network from the depth of edges that events show."""
-        manager, model = self.datamanager, self.model
-        depth_range = scene_depth_range(manager.recording, manager.config.dataparser.depth_range)
-        views = edge_depth(manager.recording, depth_range)
-        if not any(len(view.points) for view in views):
+        model = self.model
+        places, edges = self.datamanager.edges()
+        if not len(edges):
             return
-        edges = np.concatenate([view.points for view in views])
-        places = np.concatenate([np.broadcast_to(view.pose[:, 3], view.points.shape) for view in views])
-        starts, ends = (
-            manager.event_camera.in_scene(torch.from_numpy(points).to(self.device)).float()
-            for points in (places, edges)
-        )
         if self._viewer is not None:
-            self._viewer.draw_edges(ends)
+            self._viewer.draw_edges(edges)
         assert model.config.near_plane is not None
         densities = [density for density in (model.field.geometry, model.proposal) if density is not None]
-        start_from_edges(densities, starts, ends, model.config.near_plane)
+        start_from_edges(densities, places, edges, model.config.near_plane)
 
     def _refine_poses(self, refiner: PoseRefiner, batch: EventBatch, step: int) -> None:
         """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""

@@ -129,7 +129,7 @@ class SceneView(ViewerControl):
             time.sleep(0.01)
 
     def draw_edges(self, edges: Float[Tensor, "edges 3"]) -> None:
-        """Draws points of edges, in scene units, until the first picture of the trained field, or as the panel says."""
+        """Draws points of edges, in scene units: before training until the first picture of the trained field."""
         self._edges = self.viser_server.scene.add_point_cloud(
             "/edges",
             edges.cpu().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
@@ -137,7 +137,7 @@ class SceneView(ViewerControl):
             point_size=EDGE_WIDTH * self._depth * VISER_NERFSTUDIO_SCALE_RATIO,
             point_shape="circle",
         )
-        self._shows_edges.visible = True
+        self._shows_edges.value = True
 
     def end(self, step: int, sentence: str) -> None:
         """Says in all browsers that training has ended, after its last step."""
@@ -229,7 +229,7 @@ class SceneView(ViewerControl):
             self._plays = gui.add_checkbox("Play", False, hint="Move along the trajectory, over and over")
             self._follows = gui.add_checkbox("Follow", True, hint="Look from where the sensor was at that moment")
             self._events = gui.add_checkbox("Events", False, hint="Draw the events of that moment on the surfaces")
-            self._shows_edges = gui.add_checkbox("Edges", True, visible=False, hint="Draw the edges that events show")
+            self._shows_edges = gui.add_checkbox("Edges", False, hint="Draw edges by the depth that events show")
             self._window = gui.add_slider("Last (ms)", 1, 100, 1, 10, hint="Time before the moment with drawn events")
             self._stops = gui.add_slider("Brightness", -4.0, 4.0, 0.1, 0.0, hint="Stops; each doubles the brightness")
             self._gamma = gui.add_slider("Gamma", 0.4, 3.0, 0.1, 1.0, hint="Above 1 brightens what is dark")
@@ -342,6 +342,9 @@ class SceneView(ViewerControl):
             time.sleep(PLAY_STEP)
 
     def _show_edges(self) -> None:
+        """Draws the edges, which takes some seconds when they are first drawn, or hides them."""
+        if self._shows_edges.value and self._edges is None:
+            self.draw_edges(self._manager.edges()[1])
         if self._edges is not None:
             self._edges.visible = self._shows_edges.value
 
@@ -367,7 +370,7 @@ class SceneView(ViewerControl):
         if is_whole and self._manager.corrections is not self._path_of:
             self._draw_path()
             self._corrected.content = self._corrections_in_words
-        if self._edges is not None and step > 0 and not self._showed_trained:
+        if step > 0 and not self._showed_trained:
             self._showed_trained, self._shows_edges.value = True, False
         if self._seen is None or model.config.contraction:
             return
