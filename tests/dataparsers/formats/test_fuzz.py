@@ -1054,9 +1054,9 @@ FOUND: dict[str, tuple[str, Callable[[Path], object], str]] = {
         change("calibration.json", "value0", "intrinsics", value=None),
         "lacks value0.intrinsics",
     ),
-    "name of 5000 letters": (
+    "name of 3000 letters": (
         "davis",
-        edit("images.txt", "images/", "x" * 5000),
+        edit("images.txt", "images/", "x" * 3000),
         "which cannot be opened (File name too long)",
     ),
 }

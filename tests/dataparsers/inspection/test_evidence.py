@@ -159,6 +159,7 @@ def test_a_fault_is_named(name: str, size: str, whole, tmp_path: Path):
     assert all(problem.what.endswith(".") and problem.advice.endswith(".") for problem in found)
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("has_frames", [True, False])
