@@ -282,7 +282,9 @@ class EnerfPipeline(VanillaPipeline):
         model = self.model
         places, edges = self.datamanager.edges()
         if not len(edges):
+            say("Events show the depth of no edge, so that the field starts without.")
             return
+        say(f"The field starts from {len(edges):,} points of edges.")
         if self._viewer is not None:
             self._viewer.draw_edges(edges)
         assert model.config.near_plane is not None

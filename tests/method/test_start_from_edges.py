@@ -54,3 +54,13 @@ def test_a_field_that_starts_from_edges_lets_light_of_known_points_through(
     with_edges = freedom(recording_of_known_points, tmp_path, model__edge_start=True)
     without = freedom(recording_of_known_points, tmp_path, model__edge_start=False)
     assert 1.0 - with_edges < 0.7 * (1.0 - without), (with_edges, without)
+
+
+def test_where_events_show_no_edge_a_line_says_so_and_training_goes_on(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = small_config(recording, tmp_path, model__edge_start=True)
+    config.pipeline.datamanager.dataparser = replace(config.pipeline.datamanager.dataparser, depth_range=(90.0, 99.0))
+    trainer = set_up(config)
+    loss, _, _ = trainer.train_iteration(0)
+    assert loss.isfinite() and "depth of no edge" in " ".join(capsys.readouterr().out.split())
