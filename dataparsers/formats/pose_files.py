@@ -18,6 +18,8 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import islice
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Literal
 
@@ -28,10 +30,10 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.columns import unit_quaternions
 from enerf_ns.dataparsers.formats.json_values import open_json
 from enerf_ns.dataparsers.formats.ros_poses import read_bag
-from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.formats.text_tables import MOST_ROWS, parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.camera import check_rotation
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import of_file, read_text, reading
+from enerf_ns.dataparsers.recording.files import LARGEST_TABLE, LONGEST_LINE, of_file, read_text, reading
 from enerf_ns.dataparsers.recording.recording import nanoseconds
 
 Order = Literal["xyzw", "wxyz"]
@@ -224,7 +226,7 @@ def _read_tum(path: Path, flags: PoseFlags, unit: str, notes: list[str]) -> Read
 def _read_euroc(path: Path, flags: PoseFlags, unit: str, notes: list[str]) -> Read:
     header: list[str] = []
     rows, numbers = [], []
-    for number, line in enumerate(read_text(path, "a CSV file of poses").splitlines(), 1):
+    for number, line in _lines(path, "a CSV file of poses"):
         cells = [cell.strip() for cell in line.split(",")]
         if number == 1 and not re.match(r"[-+.\d]", line.strip()):
             header = cells
@@ -246,14 +248,18 @@ def _read_euroc(path: Path, flags: PoseFlags, unit: str, notes: list[str]) -> Re
 def _read_colmap(path: Path, flags: PoseFlags, unit: str, notes: list[str]) -> Read:
     file = path / "images.bin"
     if file.exists():
-        with reading(file, "COLMAP's images.bin"):
-            rows = list(_binary_images(file.read_bytes()))
+        with (
+            reading(file, "COLMAP's images.bin"),
+            open(file, "rb") as opened,
+            mmap(opened.fileno(), 0, access=ACCESS_READ) as content,
+        ):
+            rows = list(_binary_images(content))
     else:
         file = path / "images.txt"
-        lines = read_text(file, "COLMAP's images.txt").splitlines()
-        written = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith("#")]
+        lines = _lines(file, "COLMAP's images.txt")
+        written = ((number, line) for number, line in lines if not line.startswith("#"))
         rows = []
-        for number, line in written[::2]:  # below each image stands a line of its points, which may be empty
+        for number, line in islice(written, 0, None, 2):  # below each image stands a line of points
             cells = line.split(maxsplit=9)
             if len(cells) != 10:
                 expected = "10 were expected: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -266,13 +272,29 @@ def _read_colmap(path: Path, flags: PoseFlags, unit: str, notes: list[str]) -> R
     return names, values[:, 4:], quaternions, "wxyz"
 
 
-def _binary_images(content: bytes) -> Iterator[tuple[str, Float64[np.ndarray, "7"]]]:
+def _lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
+    """Yields the lines of a text file, with their numbers from 1."""
+    with reading(path, expected, LARGEST_TABLE), open(path, encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, 1):
+            if number > MOST_ROWS:
+                raise RecordingError(
+                    f"{path} has more than {MOST_ROWS:,} lines, but {expected} of at most so many was expected; give a "
+                    "part of it."
+                )
+            yield number, line
+
+
+def _binary_images(content: mmap) -> Iterator[tuple[str, Float64[np.ndarray, "7"]]]:
     """Yields name, quaternion wxyz and translation of each image of images.bin."""
     (count,) = struct.unpack_from("<Q", content)
+    if count > MOST_ROWS:
+        raise ValueError(f"it states {count:,} images")
     place = 8
     for _ in range(count):
         values = np.array(struct.unpack_from("<7d", content, place + 4))
-        end = content.index(b"\0", place + 64)
+        end = content.find(b"\0", place + 64, place + 64 + LONGEST_LINE)
+        if end < 0:
+            raise ValueError(f"the name of an image does not end within {LONGEST_LINE:,} letters")
         (points,) = struct.unpack_from("<Q", content, end + 1)
         yield content[place + 64 : end].decode(), values
         place = end + 9 + 24 * points

@@ -114,6 +114,27 @@ def test_models_of_colmap_are_in_the_order_of_their_images(tmp_path: Path, kind:
     same(read(folder, dict(zip(NAMES, TIMES[np.argsort(order)].tolist(), strict=True))), TIMES, MATRICES[order])
 
 
+def test_points_of_images_may_be_many(tmp_path: Path):
+    """A model of COLMAP has tens of megabytes of points, which are passed over."""
+    file = write_colmap(tmp_path / "0", "text") / "images.txt"
+    file.write_text(file.read_text().replace("1.5 2.5 -1 3.5 4.5 7\n", "1.5 2.5 -1 " * 600_000 + "\n"))
+    assert file.stat().st_size > 2**24
+    order = np.argsort(NAMES)
+    times = dict(zip(NAMES, TIMES[np.argsort(order)].tolist(), strict=True))
+    same(read(file.parent, times), TIMES, MATRICES[order])
+
+
+@pytest.mark.parametrize(("count", "said"), [(2**62, "images"), (2, "does not end within 4,096 letters")])
+def test_a_model_without_end_is_refused(tmp_path: Path, count: int, said: str):
+    """A sparse file of gigabytes takes no memory."""
+    file = write_colmap(tmp_path / "0", "binary") / "images.bin"
+    with file.open("wb") as opened:
+        opened.write(struct.pack("<Q", count) + struct.pack("<i7di", 1, *range(1, 8), 1) + b"a" * 5000)
+        opened.truncate(6 * 2**30)
+    with pytest.raises(RecordingError, match=f"images.bin.*{said}"):
+        read(file.parent, {})
+
+
 @pytest.mark.parametrize("suffix", [".png", ""])
 def test_transforms_of_nerfstudio(tmp_path: Path, suffix: str):
     """Some programs leave out the suffix of the images."""
