@@ -98,7 +98,7 @@ def no_length() -> float:
     density = torch.full((1, 8, 1), 1e20, requires_grad=True)
     weights = _samples(torch.ones(1, 9)).get_weights(density)
     (gradient,) = torch.autograd.grad(weights.sum(), density)
-    return float(weights.abs().sum()) + int((~gradient.isfinite()).sum())
+    return float(weights.detach().abs().sum()) + int((~gradient.isfinite()).sum())
 
 
 def _half_error(dtype: torch.dtype) -> float:
