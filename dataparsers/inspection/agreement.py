@@ -149,6 +149,12 @@ class _Trials:
             self.focus.largest_delay,
         )
 
+    def delayed(self, reading: Reading) -> list[Hypothesis]:
+        """The reading with its best delay; none if that is close to the largest, since the sharpness of wrong poses may
+        grow up to there."""
+        delay = round(self.delay(reading, 1.0).value * MILLISECOND)
+        return [Hypothesis(delay, reading=reading)] if abs(delay) <= self.focus.largest_delay - FINE_REACH else []
+
     def focal_scale(self, reading: Reading, delay: Estimate, lens: float) -> Estimate:
         """The best focal length around that of a lens, both as multiples of the stated one.
 
@@ -534,7 +540,7 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
         trials = _Trials(EventFocus(recording, longer * distance))
         if not trials.focus.windows:
             continue
-        tried_for_all = [Hypothesis(), Hypothesis(round(trials.delay(AS_READ, 1.0).value * MILLISECOND))]
+        tried_for_all = [Hypothesis(), *trials.delayed(AS_READ)]
         other = _other_lens(trials, tried_for_all) if trials.focus.turn >= SMALLEST_TURN else None
         tried_for_all += [] if other is None else [other]
         heights = {
@@ -545,8 +551,8 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
         readings, is_clear = _best_readings(recording.trajectory, heights, slides)
         if not is_clear:  # the delay was searched with the poses as they were read
             for reading in sorted(heights, key=heights.__getitem__, reverse=True)[:LIKELY_READINGS]:
-                delayed = Hypothesis(round(trials.delay(reading, 1.0).value * MILLISECOND), reading=reading)
-                heights[reading] = max(heights[reading], float(trials.curve([delayed]).sum()))
+                for delayed in trials.delayed(reading):
+                    heights[reading] = max(heights[reading], float(trials.curve([delayed]).sum()))
             readings, is_clear = _best_readings(recording.trajectory, heights, slides)
         lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
         if found is None or is_clear:
