@@ -28,6 +28,7 @@ COMMANDS = {
     "inspect": ("Inspect", "check a recording before training on it"),
     "reconstruct": ("Reconstruct", "reconstruct frames from the events of a recording"),
     "report": ("Report", "show scores, error against time, pictures and videos of runs"),
+    "score": ("Score", "score the renders of any method against held-out frames"),
     "simulate": ("Simulate", "simulate the events of a scene, a mesh, a video or a trained run"),
 }
 """Class and one-line help of each command. The module has the name of the command."""
