@@ -1,6 +1,8 @@
 # make demo    set up, then simulate events, train on them, evaluate and render: outputs/demo/
 # make test    set up, then run every check and every test, of long sweeps a part;   make test-all   those in full
 # make docs    set up, then write the pages as a site: build/docs/index.html (Python 3.11 or later)
+# make results train and score every table of the pages, which takes many hours, and put them there;
+#              SLIDER_DEPTH= its recording, WEIGHTS= those of FireNet or E2VID
 # make lint    the checks alone;   make format   repair what can be repaired;   make clean   undo the set-up
 # PYTHON=...   the interpreter to set up with (3.10 to 3.12)
 
@@ -10,7 +12,7 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.10 python3; do \
 # The name of the stamp changes with what it depends on, so that an unchanged set-up costs nothing, a fresh checkout included.
 STAMP := .venv/set-up-$(shell cat pyproject.toml constraints.txt | cksum | cut -d' ' -f1)
 
-.PHONY: demo test test-all docs lint format clean
+.PHONY: demo test test-all results docs lint format clean
 
 demo: $(STAMP)
 	.venv/bin/enerf demo --output-dir outputs/demo
@@ -20,6 +22,10 @@ test: lint
 
 test-all: lint
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/pytest --exhaustive -n 2 --dist worksteal
+
+results: $(STAMP)
+	.venv/bin/python benchmarks/results.py --pages $(if $(SLIDER_DEPTH),--slider-depth "$(SLIDER_DEPTH)") \
+	    $(if $(WEIGHTS),--reconstruction-weights "$(WEIGHTS)")
 
 lint: $(STAMP)
 	.venv/bin/ruff check

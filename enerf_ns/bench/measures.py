@@ -16,7 +16,7 @@ from enerf_ns.bench.experiments import NEAR
 from enerf_ns.evaluation.lpips import Net
 from enerf_ns.evaluation.metrics import depth_rmse
 from enerf_ns.evaluation.scores import NotScored, mean_scores
-from enerf_ns.evaluation.views import HeldOutView, aligned_views
+from enerf_ns.evaluation.views import HeldOutView, aligned_views, save_pictures
 from enerf_ns.method.event_dataset import EventDataset
 from enerf_ns.method.held_out_views import expected_brightness_scale, held_out_views
 from enerf_ns.method.memory import kept_bytes
@@ -32,6 +32,10 @@ REPEATS = 9
 TRUTH = "truth.json"
 """Name of the file with the settings of the simulation, in a recording that does not state its sensor."""
 
+VIEW = "view"
+"""Folder in that of a run, with eval_img_0000.png: a held-out frame beside the render, aligned by the first
+protocol."""
+
 ProtocolScores = dict[str, dict[str, float]]
 """Scores by protocol."""
 
@@ -39,7 +43,7 @@ ProtocolScores = dict[str, dict[str, float]]
 def evaluate(
     run: Run, protocols: Sequence[str], measures: Sequence[str], nets: Sequence[Net] = ("alex",)
 ) -> tuple[ProtocolScores, dict[str, NotScored]]:
-    """Scores of a run.
+    """Scores of a run. A picture of its middle held-out frame beside the render is stored in its folder `VIEW`.
 
     Args:
         run: Trained run.
@@ -55,6 +59,8 @@ def evaluate(
     added = _depth_rmse_all_poses(run.pipeline, views) | {"ms_a_step": milliseconds_a_step(run)}
     for name in measures:
         added |= MEASURES[name](run, views)
+    shown = aligned_views(views, protocols[0])[0][len(views) // 2]
+    save_pictures([shown], run.config_file.parent / VIEW)
     scores, not_scored = {}, {}
     for protocol in protocols:
         means, not_scored[protocol] = mean_scores(views, False, protocol, nets)

@@ -23,6 +23,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
+from enerf_ns.bench.inputs import code_digest, recording_digest
 from enerf_ns.bench.measures import TRUTH, evaluate
 from enerf_ns.bench.numerics.parts import error_of_parts
 from enerf_ns.bench.settings import BenchSettings
@@ -113,6 +114,7 @@ class Bench:
             torch.set_num_threads(settings.threads)
         self.output_dir = absolute(settings.output_dir)
         check_outside_recordings("--output-dir", self.output_dir)
+        self._stored = _stored_runs(self.output_dir / f"{name}.json")
 
     @property
     def cells(self) -> list[Cell]:
@@ -134,13 +136,13 @@ class Bench:
             OutputError: The output folder cannot be written to.
             KeyboardInterrupt: Training was interrupted.
         """
-        runs: list[dict[str, Any]] = []
+        found = {cell: self._finished(cell) for cell in self.cells}
         for cell in self.cells:
-            result = self._finished(cell)
+            result = found[cell]
             if result is None:
                 yield cell, None
-                result = self._attempt(cell)
-            runs.append(result)
+                result = found[cell] = self._attempt(cell)
+            runs = [run for run in found.values() if run is not None]
             results = self.results(runs)
             for suffix, content in {
                 "json": json.dumps(results, indent=1) + "\n",
@@ -149,7 +151,7 @@ class Bench:
             }.items():
                 self._write(self.output_dir / f"{self.name}.{suffix}", content)
             yield cell, result
-        picture = diagram(self.results(runs))
+        picture = diagram(self.results([run for run in found.values() if run is not None]))
         if picture is not None:
             self._write(self.output_dir / f"{self.name}.png", picture)
 
@@ -211,7 +213,7 @@ class Bench:
         return {**sequence.changes, **row.changes, **known, "machine.seed": cell.seed}
 
     def _about(self, cell: Cell) -> dict[str, Any]:
-        """Everything that a result depends on, except the version of the code."""
+        """Everything that a result depends on."""
         row, sequence, settings = ROWS[cell.row], SEQUENCES[cell.sequence], self.settings
         simulation = self._simulation(cell)
         weights = settings.reconstruction_weights if row.reconstruction == "e2vid" else None
@@ -220,7 +222,8 @@ class Bench:
             "changes": self._changes(cell),
             "factors": row.factors,
             "preset": sequence.preset,
-            "recording": str(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
+            "code": code_digest(),
+            "recording": recording_digest(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
             "reconstruction": row.reconstruction,
             "weights": weights and hashlib.sha256(expanded(weights).read_bytes()).hexdigest(),
             "budget": settings.budget,
@@ -239,17 +242,18 @@ class Bench:
         return self.output_dir / "runs" / cell.sequence / self._method(cell) / name
 
     def _finished(self, cell: Cell) -> dict[str, Any] | None:
-        """The stored result of a cell; None if there is none or the training failed."""
+        """The stored result of a cell with the same inputs: of its run, or in the result file, which may come from
+        another machine. None if there is none or the training failed."""
         try:
             result = json.loads((self._folder(cell) / RESULT).read_text())
         except (OSError, ValueError):
-            return None
-        return None if "failure" in result else result
+            result = self._stored.get(_digest(self._about(cell)))
+        return None if result is None or "failure" in result else result
 
     def _attempt(self, cell: Cell) -> dict[str, Any]:
         """Trains and scores a cell, and stores its result or its failure."""
         folder, about = self._folder(cell), self._about(cell)
-        result = {**asdict(cell), "settings": about, "version": code_version()}
+        result = {**asdict(cell), "settings": about, "inputs": _digest(about), "version": code_version()}
         result |= {"device": about["device"], "threads": about["threads"]}
         shutil.rmtree(folder, ignore_errors=True)
         self._write(folder / LOG, "")
@@ -270,13 +274,14 @@ class Bench:
         config = self._config(cell, folder)
         config.max_num_iterations = steps_of(self.settings.budget, config)
         run = train(config)
-        assert run.train_seconds is not None
+        assert run.train_seconds is not None and run.processor_seconds is not None
         columns = self.experiment.columns
         nets: list[Net] = [net for net, network in NETWORKS.items() if net == "alex" or network.score in columns]
         scores, not_scored = evaluate(run, self.experiment.protocols, self.experiment.measures, nets)
         result: dict[str, Any] = {
             "steps": config.max_num_iterations,
             "seconds": round(run.train_seconds, 2),
+            "processor_seconds": round(run.processor_seconds, 2),
             "scores": scores,
         }
         if self.experiment.parts:
@@ -371,6 +376,14 @@ def _results_of(against: Path | None) -> dict[str, Any] | None:
     if not table:
         raise FlagError(f"--against {against} holds no runs; give a result file (.json) that has some.")
     return found
+
+
+def _stored_runs(file: Path) -> dict[str, dict[str, Any]]:
+    """The runs in a result file by their inputs; none if there is no such file."""
+    try:
+        return {run["inputs"]: run for run in json.loads(file.read_text())["runs"] if "inputs" in run}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def parse_budget(budget: str) -> tuple[float, bool]:

@@ -63,7 +63,7 @@ class Line:
     published: dict[str, float] = field(default_factory=dict)
     """Published scores by name."""
     seconds: list[float] = field(default_factory=list)
-    """Training time of each run, s."""
+    """Training time of each run, s: that of the processor on a CPU."""
     steps: list[int] = field(default_factory=list)
     """Number of training steps of each run."""
 
@@ -97,13 +97,18 @@ def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
         done = [run for run in runs if run["seed"] == seed and "failure" not in run]
         if len(done) < num_sequences:
             continue
-        line.seconds += [run["seconds"] for run in done]
+        line.seconds += [seconds_of(run) for run in done]
         line.steps += [run["steps"] for run in done]
         scores = [run["scores"][line.protocol] for run in done]
         for name in scores[0]:
             values = [of_run[name] for of_run in scores if of_run.get(name) is not None]
             if len(values) == num_sequences:
                 line.scores.setdefault(name, []).append(mean(values))
+
+
+def seconds_of(run: dict[str, Any]) -> float:
+    """Training time of a run, s: that of the processor on a CPU, since other programs hardly change it."""
+    return run["processor_seconds"] if run["device"] == "CPU" and "processor_seconds" in run else run["seconds"]
 
 
 @dataclass(frozen=True)
@@ -224,6 +229,8 @@ def remarks(results: Results) -> Iterator[str]:
         )
     if len({run["version"] for run in runs}) > 1:
         yield "Rows come from more than one version of the code."
+    if any(run["device"] == "CPU" and "processor_seconds" in run for run in runs):
+        yield "Seconds are those of the processor in the training steps."
     yield from results["notes"]
     if results["reconstruction_weights"] and any(run["row"] == "e2vid" for run in runs):
         yield f"e2vid reconstructs with the weights {results['reconstruction_weights']}."

@@ -97,6 +97,9 @@ class ErrorAgainstTime:
         self.pipeline, self.folder, self.num_steps, self.share = pipeline, folder, num_steps, share
         self.seconds = 0.0
         """Time (s) of all training steps, without evaluation, checkpoints and the viewer."""
+        self.processor_seconds = 0.0
+        """Time (s) of the processor in these steps since this session began, summed over its cores. Other programs on
+        the machine hardly change it."""
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
         """Seconds of each evaluation, by its kind."""
         self.verdict: Verdict | None = None
@@ -156,7 +159,7 @@ class ErrorAgainstTime:
         """Measures the time of the block, a training step, and of its parts if a moment follows it."""
         watch = self.pipeline.stopwatch
         timed = self._is_due or number + 1 == self.num_steps
-        begin = time.perf_counter()
+        begin, processor = time.perf_counter(), time.process_time()
         if timed:
             watch.start()
         yield
@@ -165,6 +168,7 @@ class ErrorAgainstTime:
             self._parts = watch.stop()
         taken = time.perf_counter() - begin
         self.seconds += taken
+        self.processor_seconds += time.process_time() - processor
         if number > self._first:  # which compiles
             self._durations.append(taken)
 

@@ -35,6 +35,8 @@ class Run:
     """The pipeline, with the parameters of the last checkpoint."""
     train_seconds: float | None = None
     """Time (s) of all training steps; None for a run that was loaded."""
+    processor_seconds: float | None = None
+    """Time (s) of the processor in these steps, summed over its cores; None for a run that was loaded."""
 
 
 def method_config(
@@ -107,7 +109,8 @@ def train(config: EnerfTrainerConfig) -> Run:
     finally:
         profiler.flush_profiler(config.logging)
     run = load(config.get_base_dir() / "config.yml")
-    return replace(run, train_seconds=trainer.error_against_time.seconds)
+    time = trainer.error_against_time
+    return replace(run, train_seconds=time.seconds, processor_seconds=time.processor_seconds)
 
 
 def load(config_file: Path) -> Run:

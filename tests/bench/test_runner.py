@@ -59,6 +59,7 @@ def table(folder: Path) -> list[dict[str, Any]]:
     runs = json.loads((folder / "design.json").read_text())["runs"]
     for run in runs:
         run.pop("seconds")
+        run.pop("processor_seconds", None)
         for scores in run["scores"].values():
             scores.pop("ms_a_step")
     return runs
@@ -72,6 +73,21 @@ def test_what_is_finished_is_not_run_again_and_gives_the_same_tables(finished: P
     assert finish(folder) == []
     assert {file: file.read_bytes() for file in folder.glob("design.*")} == written
     assert {file.suffix for file in written} == {".md", ".json", ".csv"}
+
+
+def test_a_result_file_alone_is_enough_to_go_on(finished: Path, tmp_path: Path):
+    """It may be the committed one, made on another machine."""
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    before = table(folder)
+    shutil.rmtree(folder / "runs")
+    assert finish(folder) == []
+    assert table(folder) == before
+
+
+def test_a_result_of_other_code_is_made_again(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    monkeypatch.setattr(runner, "code_digest", lambda: "other code")
+    assert len(finish(folder)) == len(table(folder))
 
 
 @pytest.mark.parametrize(("better", "fails"), [(-1.0, False), (0.0, False), (1.0, True)])

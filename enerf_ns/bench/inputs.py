@@ -1,0 +1,106 @@
+"""What the result of a training depends on: the code that runs, and the files of the recording."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import enerf_ns
+import enerf_ns.dataparsers
+
+ROOTS = (
+    "enerf_ns.method.config",
+    "enerf_ns.method.runs",
+    "enerf_ns.bench.measures",
+    "enerf_ns.kernels.fast_hash_encoding",
+    "enerf_ns.kernels.hash_grid_triton",
+    "enerf_ns.simulator.engine",
+    "enerf_ns.reconstruction.reconstruction",
+    "enerf_ns.dataparsers.formats.event_recording",
+)
+"""Modules that a training calls. All that they import counts, too."""
+
+LEFT_OUT = (
+    "enerf_ns.bench.experiments",
+    "enerf_ns.bench.numerics",
+    "enerf_ns.dataparsers.formats.registry",
+    "enerf_ns.method.viewer",
+    "enerf_ns.report",
+)
+"""Modules and packages that change no result: experiments, whose settings count by themselves; readers of other
+formats; viewer and reports."""
+
+LARGEST_HASHED = 16_000_000
+"""Size in bytes up to which the content of a file of a recording counts, and not only its name and size."""
+
+
+@cache
+def code_digest() -> str:
+    """A short name for the code of a training, without its comments and docstrings."""
+    found = hashlib.sha256()
+    for name in sorted(modules(ROOTS)):
+        found.update(f"{name} {ast.dump(_without_docstrings(_parsed(name)))}".encode())
+    return found.hexdigest()[:10]
+
+
+def modules(roots: Iterable[str]) -> set[str]:
+    """Names of the modules of this package that some modules import, at any level, and of these."""
+    found: set[str] = set()
+    to_do = list(roots)
+    while to_do:
+        name = to_do.pop()
+        if name not in found and not any(name == out or name.startswith(f"{out}.") for out in LEFT_OUT):
+            found.add(name)
+            to_do += _imported(_parsed(name))
+    return found
+
+
+def recording_digest(folder: Path) -> str:
+    """A short name for a recording: names and sizes of its files, and the content of those that are not large."""
+    found = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        size = file.stat().st_size
+        found.update(f"{file.relative_to(folder)} {size} ".encode())
+        if size <= LARGEST_HASHED:
+            found.update(file.read_bytes())
+    return found.hexdigest()[:10]
+
+
+def _file(name: str) -> Path | None:
+    """The file of a module of this package; None for any other name."""
+    for package in (enerf_ns.dataparsers, enerf_ns):
+        if name == package.__name__ or name.startswith(f"{package.__name__}."):
+            place = Path(package.__path__[0], *name.split(".")[package.__name__.count(".") + 1 :])
+            found = [file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()]
+            return found[0] if found else None
+    return None
+
+
+@cache
+def _parsed(name: str) -> ast.Module:
+    file = _file(name)
+    assert file is not None, name
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def _imported(module: ast.Module) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(module):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {name for name in names if _file(name)}
+
+
+def _without_docstrings(module: ast.Module) -> ast.Module:
+    """The module without strings that stand alone, which are docstrings."""
+
+    class Stripped(ast.NodeTransformer):
+        def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+            return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
+
+    return Stripped().visit(ast.parse(ast.unparse(module)))
