@@ -1,4 +1,4 @@
-"""What the result of a training depends on: the code that runs, and the files of the recording."""
+"""Inputs of the result of a training: the code that runs, and the files of the recording."""
 
 from __future__ import annotations
 

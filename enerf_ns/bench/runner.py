@@ -236,7 +236,7 @@ class Bench:
         }
         return json.loads(json.dumps(about))
 
-    def _folder(self, cell: Cell) -> Path:
+    def folder(self, cell: Cell) -> Path:
         """Folder of the run of a cell, in the layout of Nerfstudio."""
         name = f"{cell.row.replace('/', '-over-')}-seed-{cell.seed}-{_digest(self._about(cell))}"
         return self.output_dir / "runs" / cell.sequence / self._method(cell) / name
@@ -245,14 +245,14 @@ class Bench:
         """The stored result of a cell with the same inputs: of its run, or in the result file, which may come from
         another machine. None if there is none or the training failed."""
         try:
-            result = json.loads((self._folder(cell) / RESULT).read_text())
+            result = json.loads((self.folder(cell) / RESULT).read_text())
         except (OSError, ValueError):
             result = self._stored.get(_digest(self._about(cell)))
         return None if result is None or "failure" in result else result
 
     def _attempt(self, cell: Cell) -> dict[str, Any]:
         """Trains and scores a cell, and stores its result or its failure."""
-        folder, about = self._folder(cell), self._about(cell)
+        folder, about = self.folder(cell), self._about(cell)
         result = {**asdict(cell), "settings": about, "inputs": _digest(about), "version": code_version()}
         result |= {"device": about["device"], "threads": about["threads"]}
         shutil.rmtree(folder, ignore_errors=True)

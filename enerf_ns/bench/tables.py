@@ -49,6 +49,7 @@ LARGEST_LOSS = 0.3
 """PSNR (dB, mean over the seeds) that a row may lose against another version."""
 
 LOWER_IS_BETTER = ("lpips", "lpips_vgg", "depth_rmse", "depth_rmse_all_poses", "near_depth_error", "ms_a_step")
+HIGHER_IS_BETTER = ("psnr", "ssim", "correlation", "event_correlation")
 
 
 @dataclass
@@ -145,8 +146,12 @@ def changes_table(changes: list[Change], file: str) -> Table:
     return Table(f"PSNR against {file}, largest loss first", header, rows, num_words=2)
 
 
-def scores_table(results: Results) -> Table:
-    """The scores of all rows and sequences beside the published ones."""
+def scores_table(results: Results, bold: bool = False) -> Table:
+    """The scores of all rows and sequences beside the published ones.
+
+    Args:
+        bold: Whether the best mean of each sequence is bold, as Markdown marks it, where several rows have one.
+    """
     table, columns = lines(results), results["columns"]
     theirs = [name for name in columns if any(name in line.published for line in table)]
     several = len(results["protocols"]) > 1
@@ -156,12 +161,28 @@ def scores_table(results: Results) -> Table:
     content = []
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
-        cells += [_score(name, line.scores.get(name, [])) + _truth(name, line) for name in columns]
+        for name in columns:
+            cell = _score(name, line.scores.get(name, [])) + _truth(name, line)
+            cells.append(f"**{cell}**" if bold and _is_best(line, name, table) else cell)
         cells += [f"{mean(line.seconds):.0f}" if line.seconds else NONE]
         cells += [f"{mean(line.steps):.0f}" if line.steps else NONE]
         cells += [_published(name, line.published[name]) if name in line.published else NONE for name in theirs]
         content.append(cells)
     return Table(f"{results['experiment']}: {results['sentence']}", head, content, num_words=2)
+
+
+def _is_best(line: Line, name: str, table: list[Line]) -> bool:
+    """Whether no other row of the same sequence and protocol has a better mean, as the table prints it."""
+    if name not in (*LOWER_IS_BETTER, *HIGHER_IS_BETTER):
+        return False
+    rivals = [
+        round(mean(one.scores[name]), DIGITS.get(name, 3))
+        for one in table
+        if (one.sequence, one.protocol) == (line.sequence, line.protocol) and one.scores.get(name)
+    ]
+    best = (min if name in LOWER_IS_BETTER else max)(rivals, default=None)
+    values = line.scores.get(name)
+    return bool(values) and len(rivals) > 1 and round(mean(values), DIGITS.get(name, 3)) == best
 
 
 def _title(name: str) -> str:
@@ -249,7 +270,7 @@ def remarks(results: Results) -> Iterator[str]:
 
 def markdown(results: Results) -> str:
     """The command, the tables and the remarks as Markdown."""
-    tables = [scores_table(results)]
+    tables = [scores_table(results, bold=True)]
     if any("parts" in run for run in results["runs"]):
         tables.append(_parts_table(results))
     about = "".join(f"* {remark}\n" for remark in remarks(results))

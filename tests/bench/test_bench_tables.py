@@ -56,8 +56,8 @@ def rows_of(table: str) -> list[list[str]]:
 def test_our_values_stand_beside_those_that_are_published():
     table = markdown(results(run("events", 25.128), run("frames", 21.0)))
     assert rows_of(table) == [
-        ["shake", "events", "25.13", "0.500", "2", "10", "30.00", "0.90"],
-        ["shake", "frames", "21.00", "0.500", "2", "10", "20.50", "0.40"],
+        ["shake", "events", "**25.13**", "**0.500**", "2", "10", "30.00", "0.90"],
+        ["shake", "frames", "21.00", "**0.500**", "2", "10", "20.50", "0.40"],
     ]
     assert table.startswith("    enerf bench made-up --budget 10\n") and "* A note.\n" in table
     assert "1 CPU thread; version 1.0" in table and "at scale 0.25" in table and "10 steps" in table
@@ -165,7 +165,25 @@ def test_the_terminal_shows_the_cells_of_the_markdown():
     with console.capture() as shown:
         console.print(scores_table(told).rich())
     for line in rows_of(markdown(told)):
-        assert any(all(cell in printed for cell in line) for printed in shown.get().splitlines())
+        assert any(all(cell.strip("*") in printed for cell in line) for printed in shown.get().splitlines())
+    assert "**" not in shown.get()
+
+
+def test_the_best_row_of_each_sequence_is_bold_where_there_is_another():
+    def cells(*runs: dict[str, Any], column: str = "psnr") -> list[str]:
+        return [line[2] for line in rows_of(markdown(results(*runs, columns=[column], published={})))]
+
+    def depth(row: str, error: float) -> dict[str, Any]:
+        return run(row, 1.0, scores={"log-affine-set": {"depth_rmse": error, "brightness_scale": error}})
+
+    assert cells(run("events", 25.0), run("frames", 26.0)) == ["25.00", "**26.00**"]
+    assert cells(run("events", 25.0, "a"), run("frames", 24.0, "a"), run("events", 23.0, "b")) == [
+        *("**25.00**", "24.00"),
+        *("23.00", "-"),
+    ]
+    assert cells(depth("events", 0.2), depth("frames", 0.3), column="depth_rmse") == ["**0.200**", "0.300"]
+    assert cells(depth("events", 0.2), depth("frames", 0.3), column="brightness_scale") == ["0.200", "0.300"]
+    assert cells(run("events", 25.001), run("frames", 25.004), run("both", 24.0)) == ["**25.00**", "**25.00**", "24.00"]
 
 
 def test_csv_has_a_line_for_each_run_that_finished():

@@ -131,8 +131,8 @@ def test_a_result_says_what_it_was_made_of(finished: Path):
 def test_what_was_made_with_other_settings_is_run_again(finished: Path, changes: dict[str, Any]):
     """The last cell is of another seed where there are more."""
     run = bench(finished, **changes)
-    assert not run._folder(run.cells[-1]).exists()
-    assert bench(finished)._folder(run.cells[0]).exists()
+    assert not run.folder(run.cells[-1]).exists()
+    assert bench(finished).folder(run.cells[0]).exists()
 
 
 @pytest.mark.usefixtures("python_interrupts")
@@ -214,7 +214,7 @@ def test_a_simulation_that_was_cut_short_is_not_used(finished: Path, tmp_path: P
 def test_experiments_share_the_runs_of_rows_and_sequences_that_they_share():
     def folders(name: str) -> set[Path]:
         run = Bench(name, BenchSettings())
-        return {run._folder(cell) for cell in run.cells}
+        return {run.folder(cell) for cell in run.cells}
 
     shared = folders("spiral") | folders("shake")
     assert folders("depth") < shared and len(folders("views") & shared) == 2
