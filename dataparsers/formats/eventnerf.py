@@ -96,7 +96,7 @@ MOST_IN_FIRST_STEP = 0.5
 """Largest share of the events in the first step between views."""
 
 LEAST_OVERLAP = 0.5
-"""Least share of the time of the views, where their names state it, that events fill."""
+"""Least share of the time of the views that events fill."""
 
 HELD_OUT_SPLITS = ("validation", "test")
 
@@ -367,8 +367,11 @@ def _view_times(
         raise FlagError(f"--duration-s {duration_s:g} is no time; give a number of seconds above 0.")
     duration = VIEW_STEP * (len(steps) - 1) if duration_s is None else round(duration_s * 1e9)
     if numbers is None or numbers[-1] - numbers[0] == len(numbers) - 1:
-        if last <= 0:
-            raise RecordingError(f"{events_file} holds times up to {last:g}, but times above 0 were expected.")
+        if last <= 0 or last - first < LEAST_OVERLAP * last:
+            raise RecordingError(
+                f"{events_file} holds times from {first:g} to {last:g}, but times from about 0 on were expected, since "
+                "the views are spread from 0 to the last one; subtract the time of the first view."
+            )
         return np.rint(steps * (duration / steps[-1])).astype(np.int64), duration / last
     stated = np.array(numbers, np.float64)
     overlap = min(last, stated[-1]) - max(first, stated[0])

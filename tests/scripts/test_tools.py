@@ -30,6 +30,7 @@ import pytest
 import test_eds
 import test_esim_npz
 import test_event_recording
+import test_eventnerf
 import test_tum_vie
 import torch
 import yaml
@@ -124,6 +125,7 @@ RECORDINGS: dict[str, Callable[[Path], Path]] = {
     "tumvie-events, prepared": lambda folder: tum_vie(folder, "left", test_tum_vie.write_prepared),
     "tumvie-events --event-camera right": lambda folder: tum_vie(folder, "right", test_tum_vie.write_raw),
     "esim-npz": esim_npz,
+    "eventnerf-events --split train": lambda folder: test_eventnerf.write_eventnerf(folder, split="train"),
     "event-recording": lambda folder: test_event_recording.write_recording(folder, ("frames",)),
 }
 
