@@ -29,6 +29,7 @@ import test_event_recording
 import test_eventnerf
 import test_files
 import test_fuzz
+import test_llff_events
 import test_tum_vie
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
@@ -111,6 +112,14 @@ FILES: dict[str, tuple[str, ...]] = {
         "train/intrinsics/r_00003.txt",
         "train/rgb/r_00002.png",
     ),
+    "llff_events": (
+        "events.h5",
+        "poses_bounds.npy",
+        "all_poses_bounds.npy",
+        "all_timestamps.npy",
+        "images_1/timestamps.npz",
+        "images_1/01.png",
+    ),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -163,6 +172,7 @@ def cases_of_tables() -> dict[str, Wrong]:
         "small own": test_event_recording.BAD_FILES,
         "small npz": test_esim_npz.BAD_INPUT,
         "eventnerf": test_eventnerf.BAD_INPUT,
+        "llff_events": test_llff_events.BAD_INPUT,
     }
     for whole, table in tables.items():
         for name, (fault, *said) in table.items():

@@ -31,6 +31,7 @@ import test_eds
 import test_esim_npz
 import test_event_recording
 import test_eventnerf
+import test_llff_events
 import test_tum_vie
 import torch
 import yaml
@@ -126,6 +127,7 @@ RECORDINGS: dict[str, Callable[[Path], Path]] = {
     "tumvie-events --event-camera right": lambda folder: tum_vie(folder, "right", test_tum_vie.write_raw),
     "esim-npz": esim_npz,
     "eventnerf-events --split train": lambda folder: test_eventnerf.write_eventnerf(folder, split="train"),
+    "llff-events": test_llff_events.write_llff_events,
     "event-recording": lambda folder: test_event_recording.write_recording(folder, ("frames",)),
 }
 

@@ -31,6 +31,7 @@ import test_eds
 import test_esim_npz
 import test_event_recording
 import test_eventnerf
+import test_llff_events
 import test_tum_vie
 import torch
 import yaml
@@ -299,6 +300,21 @@ def plain_eventnerf(folder: Path) -> Plain:
     return Plain(np.column_stack([x, y, t, p]), times, poses, times, times)
 
 
+def plain_llff_events(folder: Path) -> Plain:
+    rows, times = (
+        np.load(folder / "all_poses_bounds.npy"),
+        np.load(folder / "all_timestamps.npy").astype(np.int64) * 1000,
+    )
+    matrix = rows[:, :15].reshape(-1, 3, 5)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    axes = np.stack([matrix[:, :, 1], matrix[:, :, 0], -matrix[:, :, 2]], axis=2)
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_matrix(axes).as_matrix(), matrix[:, :, 3]
+    events, order = hdf5_events(folder / "events.h5"), np.argsort(times, kind="stable")
+    if events[-1, 2] > 30 * times.max():  # whole nanoseconds
+        events[:, 2] //= 1000
+    return Plain(events, times[order], poses[order], *np.zeros((2, 0), np.int64), starts_at_zero=False)
+
+
 LAYOUTS = {
     "eds_raw": Layout("eds", partial(write_eds, prepared=False), partial(plain_eds, prepared=False), ("*.yaml",)),
     "eds_prepared": Layout(
@@ -324,6 +340,7 @@ LAYOUTS = {
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
     "eventnerf": Layout("eventnerf", test_eventnerf.write_eventnerf, plain_eventnerf),
+    "llff_events": Layout("llff_events", test_llff_events.write_llff_events, plain_llff_events),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -356,7 +373,7 @@ OPTIONAL_KEYS = (
 )
 LISTS_OF_ANY_LENGTH = ("frames", "distortion")
 
-WITH_FLOATS = ("eventnerf",)
+WITH_FLOATS = ("eventnerf", "llff_events")
 """Formats whose columns of events may be floats."""
 OF_ANY_UNIT = "t of any unit"
 TIMES, COORDINATES, POLARITIES = (
@@ -608,7 +625,9 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         del group[name]
         if kind == "removed":
             return "refused"
-        group[name], outcome = damage_array(draw, name, array)
+        is_llff = layout.format == "llff_events"  # which guesses the unit
+        called = OF_ANY_UNIT if is_llff and name == "t" else name
+        group[name], outcome = damage_array(draw, called, array, is_llff)
         return outcome
 
 
