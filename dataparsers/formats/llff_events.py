@@ -71,7 +71,7 @@ SAMPLED_PLACES = 20_000
 """Places whose neighbours are measured."""
 
 FAR_SHARE, FAR_TURN = 0.02, 2.0
-"""Distance between the pose of a picture and the path at its stamp that is told: share of the extent, and degrees."""
+"""Distance between the pose of a picture and the path at its stamp that a note states: share of the extent, and degrees."""
 
 BAYER_PATTERN = "RGGB"
 
@@ -426,7 +426,7 @@ def _blurred_frames(
         raise RecordingError(f"{image} is not after the blurred picture before it; give stamps that increase.")
     with of_file(images[0].parent / "timestamps.npz"):
         files = tuple(images[i] for i in chosen)
-        return Frames(files, times, camera, trajectory, exposures=(ends - starts)[chosen])
+        return Frames(files, times, camera, trajectory, exposures=(ends - starts)[chosen], numbers=chosen)
 
 
 def _held_out(
@@ -441,7 +441,8 @@ def _held_out(
         return None
     times = np.arange(len(chosen), dtype=np.int64) * 10**9
     rotations = Rotation.from_matrix(poses[chosen][:, :, :3]).as_quat()
-    return Frames(tuple(images[i] for i in chosen), times, camera, Trajectory(times, poses[chosen][:, :, 3], rotations))
+    trajectory = Trajectory(times, poses[chosen][:, :, 3], rotations)
+    return Frames(tuple(images[i] for i in chosen), times, camera, trajectory, numbers=chosen)
 
 
 def _compare(poses: np.ndarray, frames: Frames, path: Path, notes: list[str]) -> None:
