@@ -71,7 +71,7 @@ SAMPLED_PLACES = 20_000
 """Places whose neighbours are measured."""
 
 FAR_SHARE, FAR_TURN = 0.02, 2.0
-"""Distance between the pose of a picture and the path at its stamp that a note states: share of the extent, and degrees."""
+"""Distance between the pose of a picture and the path at its stamp that a note states: share of the extent, degrees."""
 
 BAYER_PATTERN = "RGGB"
 
