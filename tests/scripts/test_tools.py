@@ -39,6 +39,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from warm_commands import WarmCommands
 
+from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
@@ -185,10 +186,10 @@ def test_every_format_trains_as_it_is_unpacked(call, name: str, capsys: pytest.C
     (config,) = Path("outputs").glob("*/enerf/*/config.yml")
     assert list((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
     parser = yaml.load(config.read_text(), Loader=yaml.Loader).pipeline.datamanager.dataparser
-    assert getattr(parser.options, "event_camera", "left") == (flags[-1] if flags else "left")
-    assert (
-        f"({format.removesuffix('-events').replace('tumvie', 'tum_vie').replace('-', '_')})" in capsys.readouterr().out
-    )
+    for flag, value in zip(flags[::2], flags[1::2], strict=True):
+        assert getattr(parser.options, flag.removeprefix("--").replace("-", "_")) == value
+    (read,) = (known.name for known in formats() if known.command == format)
+    assert f"({read})" in capsys.readouterr().out
     assert contents(data) == before
 
 
