@@ -159,7 +159,9 @@ def test_events_that_a_map_moved_are_those_of_the_sensor(tmp_path: Path):
     found = joined(recording.stream_events())
     np.testing.assert_array_equal(np.column_stack([found.x, found.y]), EVENTS[:, :2])
     np.testing.assert_allclose(
-        recording.camera.pixel_directions()[..., :2], directions_of(*map(np.float64, places())), rtol=1e-12
+        recording.camera.pixel_directions()[..., :2],
+        directions_of(*(column.astype(np.float64) for column in places())),
+        rtol=1e-12,
     )
     assert recording.blurred_frames is not None and recording.blurred_frames.camera.model == "pinhole"
 
@@ -226,7 +228,8 @@ def test_poses_of_pictures_that_are_far_from_the_path_are_told(tmp_path: Path):
 def h5(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
     def changed(folder: Path) -> None:
         with h5py.File(folder / "events.h5", "r+") as file:
-            column = file[name][...]
+            dataset: Any = file[name]
+            column = dataset[...]
             del file[name]
             file[name] = change(column)
 
