@@ -108,6 +108,8 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "tum_vie_prepared": ("calib_undist.json", "mocap-imu-calib.json"),
             "esim_npz": ("camera_calibration.npz",),
             "esim_bag": ("esim.bag", "esim.conf"),
+            "llff_events": ("all_poses_bounds.npy", "all_timestamps.npy", "images_1/timestamps.npz", "events.h5"),
+            "eventnerf": ("train/events/test.npz", "train/pose/r_00000.txt", "train/intrinsics/r_00003.txt"),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),
         }.items()

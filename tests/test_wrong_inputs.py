@@ -26,8 +26,10 @@ import test_eds
 import test_esim_npz
 import test_event_files
 import test_event_recording
+import test_eventnerf
 import test_files
 import test_fuzz
+import test_llff_events
 import test_tum_vie
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
@@ -104,6 +106,20 @@ FILES: dict[str, tuple[str, ...]] = {
     "davis": ("events.txt", "groundtruth.txt", "calib.txt", "images/frame_00000001.png"),
     "esim_npz": ("camera_calibration.npz", "camera_poses.npz", "raw_events.npz"),
     "esim_bag": ("esim.bag",),
+    "eventnerf": (
+        "train/events/test.npz",
+        "train/pose/r_00000.txt",
+        "train/intrinsics/r_00003.txt",
+        "train/rgb/r_00002.png",
+    ),
+    "llff_events": (
+        "events.h5",
+        "poses_bounds.npy",
+        "all_poses_bounds.npy",
+        "all_timestamps.npy",
+        "images_1/timestamps.npz",
+        "images_1/01.png",
+    ),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -155,6 +171,8 @@ def cases_of_tables() -> dict[str, Wrong]:
         "tum_vie_prepared": test_tum_vie.BAD_PREPARED,
         "small own": test_event_recording.BAD_FILES,
         "small npz": test_esim_npz.BAD_INPUT,
+        "eventnerf": test_eventnerf.BAD_INPUT,
+        "llff_events": test_llff_events.BAD_INPUT,
     }
     for whole, table in tables.items():
         for name, (fault, *said) in table.items():

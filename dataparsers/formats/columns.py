@@ -35,18 +35,23 @@ QUATERNION_TOLERANCE = 1e-3
 """Largest error of the norm of a quaternion that is renormalised."""
 
 
-def check_columns(path: Path, columns: Mapping[str, np.ndarray | h5py.Dataset], unit: str) -> None:
+def check_columns(
+    path: Path, columns: Mapping[str, np.ndarray | h5py.Dataset], unit: str, floats: bool = False
+) -> None:
     """Checks the types, shapes and lengths of the columns of events.
 
     Args:
         path: The file or folder of the columns.
         columns: The columns x, y, t and p by name, such as t or t.npy; p may be Boolean.
         unit: The unit of the times, us or ns, for the error message.
+        floats: Whether all columns but p may hold floats.
 
     Raises:
         RecordingError: A column does not hold one whole number for each event, or there are no events.
     """
     for name, column in columns.items():
+        if floats and column.ndim == 1 and column.dtype.kind == "f" and not name.startswith("p"):
+            continue
         if name.startswith("t") and column.ndim == 1 and column.dtype.kind == "f" and len(column) >= FEWEST_EVENTS:
             step = float(column[-1] - column[0]) / len(column)
             likely = unit_of_date(float(column[-1])) or likely_unit(step, "events")

@@ -270,8 +270,8 @@ def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4
 
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"])
     text = read_text(path, "a Kalibr camchain", LARGEST_CAMCHAIN)
-    loader = Loader(text)
     try:
+        loader = Loader(text)
         node = loader.get_single_node()
         if node is not None:
             _num_values(node, {})

@@ -20,7 +20,6 @@ https://github.com/wengflow/robust-e-nerf.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -30,22 +29,20 @@ import numpy as np
 
 from enerf_ns.dataparsers.formats.columns import check_lengths, check_times
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.npz_arrays import EXPECTED, Form, StoredArray, open_arrays
 from enerf_ns.dataparsers.formats.robust_enerf import (
     checked_camera,
     checked_trajectory,
-    listed,
     read_views,
     whole_nanoseconds,
 )
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, check_npy_header, of_file, reading
+from enerf_ns.dataparsers.recording.files import of_file, reading
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("raw_events.npz", "camera_poses.npz", "camera_calibration.npz")
-
-KINDS = {"integers": "iu", "whole numbers or booleans": "iub", "numbers": "iuf", "text": "US"}
 
 
 def read(folder: Path) -> EventRecording:
@@ -82,71 +79,9 @@ def read(folder: Path) -> EventRecording:
         )
 
 
-class _StoredArray:
-    """An array in an .npz file, which is read from its first to its last row and never unpickled."""
-
-    def __init__(self, path: Path, archive: ZipFile, name: str, kind: str, shape: tuple[int | None, ...]):
-        if f"{name}.npy" not in archive.namelist():
-            found = listed(entry.removesuffix(".npy") for entry in archive.namelist())
-            raise RecordingError(f"{path} lacks the array {name}, and holds {found}; save it with {name}.")
-        self._stream = archive.open(f"{name}.npy")
-        version = np.lib.format.read_magic(self._stream)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"the array {name} is of version {version} of the format")
-        self._stream.seek(0)
-        check_npy_header(self._stream)
-        np.lib.format.read_magic(self._stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        self.shape, self.by_column, self.dtype = header(self._stream)
-        if self.dtype.hasobject:
-            raise RecordingError(
-                f"{path} holds {name} as pickled Python objects, which are never loaded, since they can run code; save "
-                f"it as an array of {kind}."
-            )
-        fits = len(self.shape) == len(shape) and all(
-            size in (None, found) for size, found in zip(shape, self.shape, strict=True)
-        )
-        if self.dtype.kind not in KINDS[kind] or not fits:
-            expected = "(" + ", ".join("n" if size is None else str(size) for size in shape) + ")"
-            raise RecordingError(
-                f"{path} holds {name} as {self.dtype} of shape {self.shape}, but {kind} of shape {expected} were "
-                "expected."
-            )
-        stored = archive.getinfo(f"{name}.npy").file_size - self._stream.tell()
-        if stored != math.prod(self.shape) * self.dtype.itemsize:
-            raise EOFError(f"the array {name} of shape {self.shape} does not fill its {stored:,} bytes")
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def rows(self, count: int) -> np.ndarray:
-        """Returns the next rows."""
-        return self._numbers((count, *self.shape[1:]))
-
-    def whole(self) -> np.ndarray:
-        """Returns the whole array.
-
-        Raises:
-            ValueError: It has more than `LARGEST_ARRAY` bytes.
-        """
-        if (size := math.prod(self.shape) * self.dtype.itemsize) > LARGEST_ARRAY:
-            raise ValueError(f"an array has {size:,} bytes, but at most {LARGEST_ARRAY:,} were expected")
-        return self._numbers(self.shape)
-
-    def close(self) -> None:
-        self._stream.close()
-
-    def _numbers(self, shape: tuple[int, ...]) -> np.ndarray:
-        data = self._stream.read(math.prod(shape) * self.dtype.itemsize)
-        return np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.by_column else "C")
-
-
-EXPECTED = "an .npz file of NumPy"
-
-
-def _load(path: Path, arrays: dict[str, tuple[str, tuple[int | None, ...]]]) -> list[np.ndarray]:
+def _load(path: Path, arrays: dict[str, Form]) -> list[np.ndarray]:
     with reading(path, EXPECTED), ZipFile(path) as archive:
-        return [_StoredArray(path, archive, name, *form).whole() for name, form in arrays.items()]
+        return [StoredArray(path, archive, name, *form).whole() for name, form in arrays.items()]
 
 
 def _read_trajectory(path: Path, notes: list[str]) -> Trajectory:
@@ -184,17 +119,14 @@ def _text(array: np.ndarray) -> str:
     return text.decode(errors="replace") if isinstance(text, bytes) else text
 
 
-def _open_events(path: Path, stack: ExitStack) -> tuple[_StoredArray, _StoredArray, _StoredArray]:
+def _open_events(path: Path, stack: ExitStack) -> tuple[StoredArray, StoredArray, StoredArray]:
     """Returns positions, times and polarities, which stay open until the stack closes."""
-    forms = {"position": (None, 2), "timestamp": (None,), "polarity": (None,)}
-    arrays = []
-    with reading(path, EXPECTED):
-        archive = stack.enter_context(ZipFile(path))
-        for name, shape in forms.items():
-            kind = "whole numbers or booleans" if name == "polarity" else "integers"
-            arrays.append(_StoredArray(path, archive, name, kind, shape))
-            stack.callback(arrays[-1].close)
-    position, time, polarity = arrays
+    forms: dict[str, Form] = {
+        "position": ("integers", (None, 2)),
+        "timestamp": ("integers", (None,)),
+        "polarity": ("whole numbers or booleans", (None,)),
+    }
+    position, time, polarity = open_arrays(path, forms, stack)
     check_lengths(path, {"positions": len(position), "timestamps": len(time), "polarities": len(polarity)})
     if len(time) == 0:
         raise RecordingError(f"{path} holds no events; give a recording with some.")

@@ -3,7 +3,8 @@
     events/x.npy y.npy t.npy p.npy   (n,) each: column, row, time in ns, polarity 0 or 1, or -1 or 1; in time order
     poses.txt                        t_ns px py pz qx qy qz qw; camera to world, OpenCV axes, metres
     recording.json                   camera; and, optional, frame_camera, contrast_thresholds, refractory_period_ns,
-                                     bayer_pattern, response, depth_range, reconstructed_by, white_level
+                                     bayer_pattern, response, depth_range, reconstructed_by, white_level,
+                                     frame_gamma
     camera_directions.npy            (height, width, 2) x / z and y / z of each pixel's ray, of a camera of model lookup
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
@@ -61,14 +62,14 @@ from enerf_ns.dataparsers.recording.files import (
     of_file,
     write_whole,
 )
-from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, LARGEST_GAMMA, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
 
 OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
-    *("reconstructed_by", "white_level"),
+    *("reconstructed_by", "white_level", "frame_gamma"),
 )
 STAMPS_NAME, EXPOSURES_NAME = "stamps_ns.txt", "exposures_ns.txt"
 
@@ -104,7 +105,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     if reconstructed_by is not None:
         blurred_rig = camera, trajectory
         notes.append(f"The blurred frames are reconstructed from events by {reconstructed_by}.")
-    white = _parse_white_level(about)
+    stored = _parse_white_level(about), _parse_gamma(about)
     check_is_folder(folder / "depth", "a folder of depth maps")
     depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
     with of_file(path):
@@ -115,8 +116,8 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _stream_events(folder / "events", columns),
             event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
-            frames=_read_frames(folder / "frames", poses_file, frame_camera, frame_trajectory, white, depth_files),
-            blurred_frames=_read_frames(folder / "blurred_frames", poses_file, *blurred_rig, white),
+            frames=_read_frames(folder / "frames", poses_file, frame_camera, frame_trajectory, stored, depth_files),
+            blurred_frames=_read_frames(folder / "blurred_frames", poses_file, *blurred_rig, stored),
             reconstructed_by=reconstructed_by,
             contrast_thresholds=about.pair("contrast_thresholds", "two numbers above 0, of on and off events, were"),
             depth_range=about.pair("depth_range", "the nearest and the farthest depth in metres were"),
@@ -161,6 +162,7 @@ def write(recording: EventRecording, folder: Path) -> int:
         *(recording.camera, frame_camera, recording, recording.depth_range),
         reconstructed_by=recording.reconstructed_by,
         white_level=white_level,
+        frame_gamma=next((frames.gamma for frames in kinds.values() if frames and frames.gamma != 1.0), None),
     )
     write_whole(folder / "recording.json", about)
     if recording.camera.directions is not None:
@@ -383,9 +385,10 @@ def _read_frames(
     poses_file: Path,
     camera: Camera,
     trajectory: Trajectory,
-    white: float | None,
+    stored: tuple[float | None, float],
     depth_files: Sequence[Path] = (),
 ) -> Frames | None:
+    white, gamma = stored
     stamps_file, exposures_file = folder / STAMPS_NAME, folder / EXPOSURES_NAME
     files = _images_in(folder)
     rig = files, stamps_file, camera, trajectory
@@ -395,7 +398,7 @@ def _read_frames(
             f"{folder.parent / 'recording.json'} holds white_level = {white:g}, but {files[0]} has 8 bits, of which "
             "255 is white; leave white_level out."
         )
-    return frames and replace(frames, stated_white=white)
+    return frames and replace(frames, stated_white=white, gamma=gamma)
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -440,6 +443,16 @@ def _parse_white_level(about: Value) -> float | None:
     if (white := float(value.numbers((), expected))) <= 0:
         raise value.wrong(expected)
     return white
+
+
+def _parse_gamma(about: Value) -> float:
+    value = about.get("frame_gamma")
+    if value is None:
+        return 1.0
+    expected = f"a number from 1 to {LARGEST_GAMMA:g}, which makes the values of frames linear as their exponent, was"
+    if not 1.0 <= (gamma := float(value.numbers((), expected))) <= LARGEST_GAMMA:
+        raise value.wrong(expected)
+    return gamma
 
 
 class EventRecordingWriter(Writer):

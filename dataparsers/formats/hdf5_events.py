@@ -1,7 +1,7 @@
 """Reads and writes events in HDF5 files as DSEC, TUM-VIE and EDS have them: one dataset for each column.
 
-    x, y        integers, pixels
-    t           integers, µs
+    x, y        integers, pixels; a reader may allow floats
+    t           integers, µs, or another unit that a reader states
     p           integers or booleans, polarity
     t_offset    one integer, µs, which is added to every time (optional, at the root)
 
@@ -25,7 +25,7 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
-from enerf_ns.dataparsers.recording.time_units import Times
+from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, Times
 
 if TYPE_CHECKING:
     import h5py
@@ -51,6 +51,8 @@ class Hdf5Events:
 
     Args:
         path: The file.
+        unit: Unit of the times, us or ns.
+        floats: Whether x, y and t may be floats.
 
     Raises:
         RecordingError: The file is missing, truncated, not HDF5 or empty, lacks a column, has columns of another type
@@ -65,14 +67,14 @@ class Hdf5Events:
     last_time: int
     """Time of the last event, ns on the clock of the file."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, unit: str = "us", floats: bool = False):
+        self.path, self.unit = path, unit
         self._cache = SMALLEST_CACHE
         with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
             for column in columns.values():
                 _check_filters(self.path, column)
-            check_columns(self.path, columns, "us")
+            check_columns(self.path, columns, unit, floats)
             self._offset = self._read_offset(file)
             self._cache = max(SMALLEST_CACHE, *(_chunk_bytes(column) for column in columns.values()))
             self.num_events = len(columns["t"])
@@ -81,7 +83,7 @@ class Hdf5Events:
 
     def times(self, pixels: int) -> Times:
         """Returns the times of the events of a sensor with so many pixels."""
-        return Times.of_events(self.path, "us", self.num_events, self.last_time - self.first_time, pixels)
+        return Times.of_events(self.path, self.unit, self.num_events, self.last_time - self.first_time, pixels)
 
     def stream(self, zero: int) -> Iterator[Events]:
         """Yields the `num_events` events in file order, `EVENTS_AT_A_TIME` at once.
@@ -149,10 +151,18 @@ class Hdf5Events:
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
         """Returns the times of some events, nanoseconds from `zero`."""
         times = column[start:stop]
-        check_times(self.path, times, "us", self._offset)
-        times = times.astype(np.int64)
-        times *= 1000
-        times += self._offset * 1000 - zero
+        nanoseconds = NANOSECONDS[self.unit]
+        if times.dtype.kind == "f":
+            if not np.isfinite(times).all():
+                raise RecordingError(f"{self.path} holds a time that is not finite; copy it again from its source.")
+            check_times(self.path, times, self.unit, self._offset)
+            whole = np.rint(times)
+            times = whole.astype(np.int64) * nanoseconds + np.rint((times - whole) * nanoseconds).astype(np.int64)
+        else:
+            check_times(self.path, times, self.unit, self._offset)
+            times = times.astype(np.int64)
+            times *= nanoseconds
+        times += self._offset * nanoseconds - zero
         return times
 
 

@@ -12,7 +12,17 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
+from enerf_ns.dataparsers.formats import (
+    davis,
+    eds,
+    esim,
+    esim_bag,
+    esim_npz,
+    event_recording,
+    eventnerf,
+    llff_events,
+    tum_vie,
+)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
@@ -124,7 +134,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, eventnerf, llff_events, event_recording):
     register(_module.FORMAT)
 
 

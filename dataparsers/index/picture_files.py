@@ -57,7 +57,9 @@ def write_pictures(frames: Frames) -> list[Path]:
 def _place(frames: Frames, source: Path) -> Path:
     camera, directions = frames.camera, frames.camera.directions
     lens = [getattr(camera, field.name) for field in fields(camera) if field.name != "directions"]
-    made_from = repr((LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor, frames.white_level)).encode()
+    made_from = repr(
+        (LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor, frames.white_level, frames.gamma)
+    ).encode()
     table = b"" if directions is None else directions.tobytes()
     return cache_folder() / f"pictures-{hashlib.sha256(made_from + table).hexdigest()[:32]}" / f"{source.stem}.png"
 

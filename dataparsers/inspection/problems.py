@@ -474,13 +474,13 @@ def _frame_problems(frames: Frames | None) -> Iterator[Problem]:
             f"There {'is' if len(frames.times) == 1 else 'are'} only {_count(len(frames.times), 'frame')}.",
             "Some of them are held out for scores: use a longer part, or learn from events alone.",
         )
-    intervals = np.diff(frames.times)
+    intervals, steps = np.diff(frames.times), np.diff(frames.numbers)
     if not len(intervals):
         return
-    usual = np.median(intervals)
-    missing = int((np.rint(intervals / usual) - 1).clip(0).sum())
+    usual = np.median(intervals / steps)
+    missing = int((np.rint(intervals / usual) - steps).clip(0).sum())
     if missing > MAX_SHARE_DROPPED_FRAMES * (missing + len(frames.times)):
-        widest = np.argmax(intervals)
+        widest = np.argmax(intervals / steps)
         yield Problem(
             f"In the sequence of frames {_count(missing, 'frame')} seem to be missing; they come every "
             f"{usual * 1e-6:.3g} ms, but after {frames.times[widest] * 1e-9:.2f} s there is none for "

@@ -25,6 +25,9 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 EVENTS_AT_A_TIME = 2**18
 """Number of events that a reader yields at once: enough for speed, with little memory."""
 
+LARGEST_GAMMA = 4.0
+"""Largest exponent of gamma-encoded frames. Screens have 2.2."""
+
 LONGEST_REFRACTORY_PERIOD = 10**12
 """Longest refractory period, nanoseconds."""
 
@@ -88,6 +91,8 @@ class Frames:
     """Width of a downscaled pixel in pixels of the frame, at least 1."""
     stated_white: float | None = None
     """The value of full brightness in files of more than 8 bits; None if the recording does not state it."""
+    gamma: float = 1.0
+    """Exponent, from 1 to `LARGEST_GAMMA`, that turns stored values in [0, 1] into linear brightness."""
     files_of_recording: tuple[Path, ...] = ()
     """All frames of the recording, from which that value is found if it is not stated. Default: `filenames`."""
 
@@ -125,20 +130,23 @@ class Frames:
         return f", white is {self.white_level:g}" if is_deep(self.filenames[0]) else ""
 
     def image(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
-        """Returns a frame with one or three channels: uint8, or float32 in [0, 1] for files of more bits.
+        """Returns the linear brightness of a frame with one or three channels.
+
+        It is uint8, or float32 in [0, 1] for files of more bits and for gamma-encoded ones.
 
         Raises:
             RecordingError: The file is missing or cannot be decoded, or holds a value above the stated full brightness.
         """
         image = load_image(self.filenames[index])
-        if image.dtype == np.uint8:
+        if image.dtype == np.uint8 and self.gamma == 1.0:
             return image
-        if image.max() > self.white_level:
+        white = 255.0 if image.dtype == np.uint8 else self.white_level
+        if image.max() > white:
             raise RecordingError(
-                f"{self.filenames[index]} holds {image.max():g}, but {self.white_level:g} is stated to be white; state "
-                "the largest value that the camera writes."
+                f"{self.filenames[index]} holds {image.max():g}, but {white:g} is stated to be white; state the "
+                "largest value that the camera writes."
             )
-        return image / np.float32(self.white_level)
+        return (image / np.float32(white)) ** np.float32(self.gamma)
 
     def picture(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
         """Returns a frame as the `picture_camera` sees it, of the same type as `image`; raises what `image` raises."""

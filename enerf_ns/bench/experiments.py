@@ -204,6 +204,10 @@ SENSORS: dict[str, Sequence] = {
 """Sequences with one fault of the sensor each, and with several. medium and hard have the spreads of thresholds and the
 refractory periods of Robust e-NeRF (Low and Lee, ICCV 2023)."""
 
+EV_DEBLUR_BLENDER = ("blurfactory", "bluroutdoorpool", "blurtanabata", "blurwine")
+EV_DEBLUR_CDAVIS = ("blurbatteries", "blurdrones", "blurequipment", "blurfigures", "blurpowersupplies")
+"""Scenes in the configs of Ev-DeblurNeRF's authors."""
+
 SEQUENCES: dict[str, Sequence] = {
     **{name: Sequence(name, preset=name) for name in FIVE},
     "spiral1-sparse": Sequence("spiral1", preset="spiral1-sparse"),
@@ -227,6 +231,18 @@ SEQUENCES: dict[str, Sequence] = {
     "slider_depth": Sequence(),
     **{name: Sequence() for name in published.UZH},
     **{name: Sequence() for name in published.EDS if name != published.MEAN},
+    **{
+        name: Sequence(
+            changes={
+                PARSER + "held_out_frame_indices": tuple(range(20, 1001, 10)),
+                SENSOR + "contrast_thresholds": (0.25, 0.25),
+            }
+        )
+        for name in published.EVENTNERF
+        if name != published.MEAN
+    },
+    **{name: Sequence(changes={SENSOR + "contrast_thresholds": (0.2, 0.2)}) for name in EV_DEBLUR_BLENDER},
+    **{name: Sequence(changes={SENSOR + "contrast_thresholds": (0.25, 0.25)}) for name in EV_DEBLUR_CDAVIS},
     "mocap-1d-trans": Sequence(preset="mocap-1d-trans"),
     "mocap-desk2": Sequence(preset="mocap-desk2"),
     "mocap-desk2-6views": Sequence(preset="mocap-desk2-6views"),
@@ -249,6 +265,12 @@ OF_BASELINES = (
     "e2vid and filter train on frames that are reconstructed from the events. filter is a complementary filter, which "
     "is not in the paper.",
     "events+blurred renders frames over their exposure. events+blurred-one-instant does not, as in the paper.",
+)
+
+OF_EV_DEBLUR = (
+    "All sharp pictures are held out, as in the publications. Their methods learn from blurred frames and events, and "
+    "render colours as frames show them, which raw compares.",
+    "The mean of the publications is over their scenes, which may be other ones than those here.",
 )
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -370,6 +392,37 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=published.TUM_VIE,
         source="GPERT",
         notes=("Frames and time range are those of E-NeRF's configs. GPERT uses those of Robust e-NeRF.",),
+    ),
+    "eventnerf": Experiment(
+        "EventNeRF's synthetic scenes (folders in --data), compared with EventNeRF and two methods of Gaussians.",
+        ("events",),
+        recorded=tuple(name for name in published.EVENTNERF if name != published.MEAN),
+        protocols=("eventnerf", "log-offset"),
+        published=published.EVENTNERF,
+        source="EventNeRF and others",
+        notes=(
+            "EventNeRF trains on all events and scores every tenth view of their path, without the first two, as here. "
+            "The threshold of 0.25 is that of its configs.",
+            "E-3DGS fits an offset alone, as log-offset, and does not state its views.",
+        ),
+    ),
+    "ev-deblur-blender": Experiment(
+        "Ev-DeblurNeRF's rendered scenes (folders in --data), compared with Ev-DeblurNeRF and DiET-GS.",
+        ("nerf-blurred", "events+blurred"),
+        recorded=EV_DEBLUR_BLENDER,
+        protocols=("raw", "log-affine-set"),
+        published=published.EV_DEBLUR_BLENDER,
+        source="Ev-DeblurNeRF and DiET-GS",
+        notes=OF_EV_DEBLUR,
+    ),
+    "ev-deblur-cdavis": Experiment(
+        "Ev-DeblurNeRF's real scenes (folders in --data), compared with Ev-DeblurNeRF and DiET-GS.",
+        ("nerf-blurred", "events+blurred"),
+        recorded=EV_DEBLUR_CDAVIS,
+        protocols=("raw", "log-affine-set"),
+        published=published.EV_DEBLUR_CDAVIS,
+        source="Ev-DeblurNeRF and DiET-GS",
+        notes=OF_EV_DEBLUR,
     ),
     "validation": Experiment(
         "Different recordings on which changes of defaults are chosen and checked.",

@@ -164,3 +164,23 @@ TUM_VIE = _table(
     },
 )
 """As printed by GPERT (CVPR 2026)."""
+
+EVENTNERF = _table(
+    ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic"),
+    {"E-3DGS (3DV 2025)": [(30.42,), (31.07,), (34.08,), (30.79,), (30.74,), (33.73,), (35.87,)]},
+    ("psnr",),
+) | _table(
+    (MEAN,),
+    {
+        "EventNeRF": [(28.85, 0.93, 0.06)],
+        "Event3DGS (CoRL 2024)": [(31.46, 0.95, 0.03)],
+        "E-3DGS (3DV 2025)": [(32.39, 0.96, 0.03)],
+    },
+)
+"""EventNeRF's synthetic scenes. E-3DGS fits an offset alone, as the protocol log-offset does."""
+
+EV_DEBLUR_BLENDER = _table((MEAN,), {"Ev-DeblurNeRF": [(24.76,)], "DiET-GS": [(26.69,)]}, ("psnr",))
+"""Means over the scenes that Ev-DeblurNeRF rendered with Blender."""
+
+EV_DEBLUR_CDAVIS = _table((MEAN,), {"Ev-DeblurNeRF": [(32.30,)], "DiET-GS": [(34.22,)]}, ("psnr",))
+"""Means over the scenes that Ev-DeblurNeRF recorded with a DAVIS of colour."""

@@ -32,6 +32,9 @@ VOXEL_PIXELS = 1.5
 TRUNCATION = 4.0
 """Truncation distance of the signed distance function, in voxels."""
 
+STRIDE = 4
+"""Step between the rows and columns of pixels at which Open3D looks for blocks. It fails if none of them is known."""
+
 BLOCK, NUM_BLOCKS = 16, 10_000
 """Voxels along each side of a block, and number of blocks with memory at first."""
 
@@ -126,8 +129,9 @@ def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh
     names, types, channels = ("tsdf", "weight", "color"), (core.float32,) * 3, (1, 1, 3)
     grid = block_grid(names, types, channels, voxel, BLOCK, NUM_BLOCKS)  # of the older volumes, one stays empty
     intrinsics = core.Tensor(camera.matrix)
-    for view, colours in zip(views, colours_of(views), strict=True):
-        if not view.known.any():
+    used = [bool(view.known[::STRIDE, ::STRIDE].any()) for view in views]
+    for view, colours, is_used in zip(views, colours_of(views), used, strict=True):
+        if not is_used:
             continue
         depth = np.where(view.known, view.depth, 0.0).astype(np.float32)[..., None]
         extrinsics = core.Tensor(np.linalg.inv(np.vstack([view.pose, [0.0, 0.0, 0.0, 1.0]])))
@@ -135,7 +139,7 @@ def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh
         given = 1.0, float(depth.max()) + 1.0, TRUNCATION
         blocks = grid.compute_unique_block_coordinates(pictures[0], intrinsics, extrinsics, *given)
         grid.integrate(blocks, *pictures, intrinsics, intrinsics, extrinsics, *given)
-    if not any(view.known.any() for view in views):
+    if not any(used):
         return trimesh.Trimesh()
     mesh = grid.extract_triangle_mesh(FEWEST_VIEWS)
     faces = mesh.triangle.indices.numpy() if "indices" in mesh.triangle else np.zeros((0, 3), int)

@@ -70,7 +70,7 @@ def test_parts_that_are_left_out_are_forced_on_otherwise():
         assert any(FORCED_ON.get(name) != value for name, value in off.items()), part
 
 
-@pytest.mark.parametrize("table", [published.EDS, published.TUM_VIE])
+@pytest.mark.parametrize("table", [published.EDS, published.TUM_VIE, published.EVENTNERF])
 def test_published_means_are_those_of_the_sequences(table: published.Published):
     for row, scores in table[MEAN].items():
         values = [rows[row]["psnr"] for name, rows in table.items() if name != MEAN and row in rows]

@@ -74,6 +74,13 @@ def test_points_are_means_within_voxels_of_what_is_known():
     assert cloud.vertices[:, 0].min() > -0.2 and cloud.vertices[:, 0].max() < 0.3
 
 
+def test_a_few_known_pixels_make_no_surface():
+    """Open3D looks at every fourth pixel."""
+    known = np.zeros((60, 80), bool)
+    known[30, 41:43] = True
+    assert not len(fused(CAMERA, wall(known), VOXEL).faces)
+
+
 def test_nothing_known_is_a_sentence_and_an_empty_mesh():
     nothing = wall(np.zeros((60, 80), bool))
     assert not len(fused(CAMERA, nothing, VOXEL).faces)

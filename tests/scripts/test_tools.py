@@ -30,6 +30,8 @@ import pytest
 import test_eds
 import test_esim_npz
 import test_event_recording
+import test_eventnerf
+import test_llff_events
 import test_tum_vie
 import torch
 import yaml
@@ -37,6 +39,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from warm_commands import WarmCommands
 
+from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
@@ -124,6 +127,8 @@ RECORDINGS: dict[str, Callable[[Path], Path]] = {
     "tumvie-events, prepared": lambda folder: tum_vie(folder, "left", test_tum_vie.write_prepared),
     "tumvie-events --event-camera right": lambda folder: tum_vie(folder, "right", test_tum_vie.write_raw),
     "esim-npz": esim_npz,
+    "eventnerf-events --split train": lambda folder: test_eventnerf.write_eventnerf(folder, split="train"),
+    "llff-events": test_llff_events.write_llff_events,
     "event-recording": lambda folder: test_event_recording.write_recording(folder, ("frames",)),
 }
 
@@ -181,10 +186,10 @@ def test_every_format_trains_as_it_is_unpacked(call, name: str, capsys: pytest.C
     (config,) = Path("outputs").glob("*/enerf/*/config.yml")
     assert list((config.parent / "nerfstudio_models").glob("step-*.ckpt"))
     parser = yaml.load(config.read_text(), Loader=yaml.Loader).pipeline.datamanager.dataparser
-    assert getattr(parser.options, "event_camera", "left") == (flags[-1] if flags else "left")
-    assert (
-        f"({format.removesuffix('-events').replace('tumvie', 'tum_vie').replace('-', '_')})" in capsys.readouterr().out
-    )
+    for flag, value in zip(flags[::2], flags[1::2], strict=True):
+        assert getattr(parser.options, flag.removeprefix("--").replace("-", "_")) == value
+    (read,) = (known.name for known in formats() if known.command == format)
+    assert f"({read})" in capsys.readouterr().out
     assert contents(data) == before
 
 

@@ -30,6 +30,8 @@ import pytest
 import test_eds
 import test_esim_npz
 import test_event_recording
+import test_eventnerf
+import test_llff_events
 import test_tum_vie
 import torch
 import yaml
@@ -285,6 +287,34 @@ def plain_own(folder: Path) -> Plain:
     return Plain(events, *poses_in(folder / "poses.txt", "ns"), stamps, stamps)
 
 
+def plain_eventnerf(folder: Path) -> Plain:
+    files = sorted((folder / "train/pose").glob("*.txt"))
+    cells = [file.read_text(encoding="utf-8-sig").split() for file in files]
+    assert all(len(row) == 16 and all(map(is_number, row)) for row in cells)
+    poses = np.array(cells, np.float64).reshape(-1, 4, 4)
+    poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
+    with np.load(folder / "train/events/test.npz") as file:
+        x, y, t, p = (file[name].astype(np.int64) for name in "xytp")
+    times = np.arange(len(files)) * 1_000_000
+    t = np.array([round(Fraction(int(time) * int(times[-1]), int(t.max()))) for time in t])
+    return Plain(np.column_stack([x, y, t, p]), times, poses, times, times)
+
+
+def plain_llff_events(folder: Path) -> Plain:
+    rows, times = (
+        np.load(folder / "all_poses_bounds.npy"),
+        np.load(folder / "all_timestamps.npy").astype(np.int64) * 1000,
+    )
+    matrix = rows[:, :15].reshape(-1, 3, 5)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    axes = np.stack([matrix[:, :, 1], matrix[:, :, 0], -matrix[:, :, 2]], axis=2)
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_matrix(axes).as_matrix(), matrix[:, :, 3]
+    events, order = hdf5_events(folder / "events.h5"), np.argsort(times, kind="stable")
+    if events[-1, 2] > 30 * times.max():  # whole nanoseconds
+        events[:, 2] //= 1000
+    return Plain(events, times[order], poses[order], *np.zeros((2, 0), np.int64), starts_at_zero=False)
+
+
 LAYOUTS = {
     "eds_raw": Layout("eds", partial(write_eds, prepared=False), partial(plain_eds, prepared=False), ("*.yaml",)),
     "eds_prepared": Layout(
@@ -309,6 +339,8 @@ LAYOUTS = {
     "davis": Layout("davis", write_small_davis, plain_davis, ("images.txt",), lists_images=True),
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
+    "eventnerf": Layout("eventnerf", test_eventnerf.write_eventnerf, plain_eventnerf),
+    "llff_events": Layout("llff_events", test_llff_events.write_llff_events, plain_llff_events),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -341,7 +373,14 @@ OPTIONAL_KEYS = (
 )
 LISTS_OF_ANY_LENGTH = ("frames", "distortion")
 
-TIMES, COORDINATES, POLARITIES = ("t", "timestamp", "T_wc_timestamp"), ("x", "y", "position"), ("p", "polarity")
+WITH_FLOATS = ("eventnerf", "llff_events")
+"""Formats whose columns of events may be floats."""
+OF_ANY_UNIT = "t of any unit"
+TIMES, COORDINATES, POLARITIES = (
+    ("t", "timestamp", "T_wc_timestamp", OF_ANY_UNIT),
+    ("x", "y", "position"),
+    ("p", "polarity"),
+)
 ARRAYS_OF_ANY_LENGTH = ("rows", "poses_bounds", "distortion_params")
 
 OUTSIDE = (-1, 1280, 2**16 + 3, 2**31 + 3, 2**32 + 3, 2**40, -(2**32) + 3)
@@ -509,15 +548,15 @@ def kinds_of_damage(name: str, array: np.ndarray) -> list[str]:
     return kinds
 
 
-def damage_array(draw: Draw, name: str, array: np.ndarray) -> tuple[np.ndarray, Outcome]:
-    """The array of a name, of which "rows" are events x y t p."""
+def damage_array(draw: Draw, name: str, array: np.ndarray, floats: bool = False) -> tuple[np.ndarray, Outcome]:
+    """The array of a name, of which "rows" are events x y t p. Whether the columns of events may be floats."""
     is_whole = name in TIMES + COORDINATES + POLARITIES
     kind = draw(st.sampled_from(kinds_of_damage(name, array)))
     place = tuple(draw(st.integers(0, size - 1)) for size in array.shape)
     note(f"{name}: {kind} at {place}")
     changed = array.copy()
     if kind == "another type":
-        types = ["c16", "S8"] + ["f8", "f4"] * is_whole
+        types = ["c16", "S8"] + ["f8", "f4"] * (is_whole and not floats)
         return np.array(5) if array.dtype.kind in "US" else array.astype(draw(st.sampled_from(types))), "refused"
     if kind == "wider type":
         return array.astype(draw(st.sampled_from(["<i8", ">i8"]))), "the same"
@@ -541,7 +580,7 @@ def damage_array(draw: Draw, name: str, array: np.ndarray) -> tuple[np.ndarray, 
         note(str(factor))
         times = changed[:, 2] if name == "rows" else changed
         times[...] = times * factor.numerator // factor.denominator
-        return changed, "refused or plain" if name == "rows" else "refused"  # rows are one of two files
+        return changed, "refused or plain" if name in ("rows", OF_ANY_UNIT) else "refused"  # rows are one of two files
     if kind == "no rotation":
         changed[place[0]] *= 1.01
         return changed, "refused"
@@ -569,7 +608,8 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         with np.load(path) as file:
             arrays = dict(file)
         name, is_removed = draw(st.sampled_from(sorted(arrays))), draw(st.sampled_from([False] * 9 + [True]))
-        array, outcome = damage_array(draw, name, arrays.pop(name))
+        called = OF_ANY_UNIT if (layout.format, name) == ("eventnerf", "t") else name
+        array, outcome = damage_array(draw, called, arrays.pop(name), layout.format in WITH_FLOATS)
         np.savez(path, **arrays, **{} if is_removed else {name: array})
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
@@ -585,7 +625,9 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         del group[name]
         if kind == "removed":
             return "refused"
-        group[name], outcome = damage_array(draw, name, array)
+        is_llff = layout.format == "llff_events"  # which guesses the unit
+        called = OF_ANY_UNIT if is_llff and name == "t" else name
+        group[name], outcome = damage_array(draw, called, array, is_llff)
         return outcome
 
 

@@ -52,6 +52,22 @@ def check(found: dict[str, np.ndarray], zero: int = 0, offset: int = 0) -> None:
     assert found["t"].dtype == np.int64
 
 
+def test_events_in_nanoseconds_between_pixels(tmp_path: Path):
+    """Where a reader allows them; times with a fraction keep it."""
+    x, t = np.array([0.25, 3.5], np.float32), np.array([5.25, 7.0])
+    data = {"x": x, "y": np.array([1, 2], np.uint16), "t": t, "p": np.array([0, 1], np.uint8)}
+    path = write(tmp_path / "events.h5", data=data)
+    found = read(Hdf5Events(path, "us", floats=True))
+    np.testing.assert_array_equal(found["x"], x)
+    assert found["t"].tolist() == [5250, 7000] and found["t"].dtype == np.int64
+    assert read(Hdf5Events(path, "ns", floats=True))["t"].tolist() == [5, 7]
+    with pytest.raises(RecordingError, match="holds x as float32"):
+        Hdf5Events(path)
+    path = write(tmp_path / "nan.h5", data=data | {"t": np.array([1.0, np.nan])})
+    with pytest.raises(RecordingError, match="holds a time that is not finite"):
+        Hdf5Events(path, "us", floats=True)
+
+
 @pytest.mark.parametrize("where", ["/", "events"])
 @pytest.mark.parametrize("offset", [None, 1_000_000_000, -1000])
 @pytest.mark.parametrize("zero", [0, EPOCH * 1000 + 789])

@@ -204,6 +204,16 @@ def test_problems_are_the_same_on_every_clock(name: str | None, zero: int):
             assert statistics.edges[0] <= start and end <= statistics.edges[-1]
 
 
+def test_frames_that_are_held_out_between_others_are_not_missing():
+    """As the sharp pictures between blurred ones."""
+    recording = made()
+    assert recording.frames is not None
+    kept = np.delete(np.arange(len(FRAME_TIMES)), slice(3, None, 4))
+    without = made(frame_times=FRAME_TIMES[kept])
+    assert any("seem to be missing" in problem.what for problem in find_problems(without))
+    assert find_problems(replace(recording, frames=recording.frames.subset(kept))) == []
+
+
 def test_a_recording_without_frames_needs_none():
     assert find_problems(made(frame_times=FRAME_TIMES[:0])) == []
 

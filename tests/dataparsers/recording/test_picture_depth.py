@@ -27,7 +27,7 @@ from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import image_size, load_image
-from enerf_ns.dataparsers.recording.picture_depth import find_white_level
+from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -289,3 +289,26 @@ def test_frames_above_the_stated_white_level_are_refused(deep: Path, tmp_path: P
 def test_inspection_says_what_is_white_and_shows_it(deep: Path):
     inspection = Inspection.of(read_recording(deep))
     assert inspection.found()["frames"].endswith(", white is 4095")
+
+
+def test_gamma_encoded_frames_are_linear_where_they_are_read(deep: Path, tmp_path: Path):
+    """Of 8 bits and of more; the files are copied as they are."""
+    for name, source in {"deep": deep, "esim": write_esim(tmp_path / "esim")}.items():
+        (tmp_path / f"own-{name}").mkdir()
+        write(read_recording(source), tmp_path / f"own-{name}")
+        encoded = read_own(tmp_path / f"own-{name}").frames
+        about = json.loads((tmp_path / f"own-{name}/recording.json").read_text())
+        (tmp_path / f"own-{name}/recording.json").write_text(json.dumps(about | {"frame_gamma": 1.8}))
+        linear = read_own(tmp_path / f"own-{name}").frames
+        assert encoded is not None and linear is not None and linear.image(1).dtype == np.float32
+        np.testing.assert_allclose(linear.image(1), brightness(encoded.image(1)).astype(float) ** 1.8, rtol=1e-5)
+
+
+@pytest.mark.parametrize("gamma", [0, 0.45, 5, "2.2", True])
+def test_a_gamma_that_is_none_is_refused(tmp_path: Path, gamma: object):
+    (tmp_path / "own").mkdir()
+    write(read_recording(write_esim(tmp_path / "esim")), tmp_path / "own")
+    about = json.loads((tmp_path / "own/recording.json").read_text()) | {"frame_gamma": gamma}
+    (tmp_path / "own/recording.json").write_text(json.dumps(about))
+    with pytest.raises(RecordingError, match=r"recording\.json holds frame_gamma = .*, but a number from 1 to 4"):
+        read_own(tmp_path / "own")
