@@ -144,7 +144,16 @@ class _StoredArray:
 EXPECTED = "an .npz file of NumPy"
 
 
-def _load(path: Path, arrays: dict[str, tuple[str, tuple[int | None, ...]]]) -> list[np.ndarray]:
+def load_npz(path: Path, arrays: dict[str, tuple[str, tuple[int | None, ...]]]) -> list[np.ndarray]:
+    """Returns arrays of an .npz file as a whole.
+
+    Args:
+        path: The file.
+        arrays: By name, one of `KINDS`, and the shape, with None for any length.
+
+    Raises:
+        RecordingError: The file cannot be read, lacks an array, or holds another kind or shape.
+    """
     with reading(path, EXPECTED), ZipFile(path) as archive:
         return [_StoredArray(path, archive, name, *form).whole() for name, form in arrays.items()]
 
@@ -155,7 +164,7 @@ def _read_trajectory(path: Path, notes: list[str]) -> Trajectory:
         "T_wc_position": ("numbers", (None, 3)),
         "T_wc_orientation": ("numbers", (None, 4)),
     }
-    times, positions, quaternions = _load(path, forms)
+    times, positions, quaternions = load_npz(path, forms)
     check_lengths(path, {"times": len(times), "positions": len(positions), "orientations": len(quaternions)})
     check_times(path, times)
     return checked_trajectory(
@@ -172,7 +181,7 @@ def _read_calibration(path: Path) -> tuple[Camera, tuple[float, float], int, str
         "distortion_model": ("text", ()),
         "bayer_pattern": ("text", ()),
     }
-    *scalars, matrix, distortion, model, pattern = _load(path, forms)
+    *scalars, matrix, distortion, model, pattern = load_npz(path, forms)
     width, height, on, off, refractory_period = (float(scalar) for scalar in scalars)
     model, pattern = (_text(text) for text in (model, pattern))
     camera = checked_camera(path, width, height, matrix, model, distortion)

@@ -30,6 +30,7 @@ import pytest
 import test_eds
 import test_esim_npz
 import test_event_recording
+import test_evimo2
 import test_tum_vie
 import torch
 import yaml
@@ -279,6 +280,21 @@ def plain_bag(folder: Path) -> Plain:
     return Plain(np.array(events, np.int64), np.array(times), matrices(rows[:, :3], rows[:, 3:]), none, none)
 
 
+def plain_evimo2(folder: Path) -> Plain:
+    """Of a camera that is not inverted."""
+    t, xy, p = (np.load(folder / f"dataset_events_{name}.npy") for name in ("t", "xy", "p"))
+    with np.load(folder / "dataset_info.npz", allow_pickle=True) as file:
+        meta = file["meta"].item()
+    rows = []
+    for instant in meta["full_trajectory"]:
+        if instant.get("cam") is not None:
+            place, turn = (instant["cam"]["pos"][name] for name in "tq")
+            rows.append([instant["cam"]["ts"], *(place[i] for i in "xyz"), *(turn[i] for i in "xyzw")])
+    poses, none = np.array(rows), np.zeros(0, np.int64)
+    events = np.column_stack([xy, np.rint(t.astype(np.float64) * 1e9).astype(np.int64), p]).astype(np.int64)
+    return Plain(events, np.rint(poses[:, 0] * 1e9).astype(np.int64), matrices(poses[:, 1:4], poses[:, 4:]), none, none)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -309,6 +325,7 @@ LAYOUTS = {
     "davis": Layout("davis", write_small_davis, plain_davis, ("images.txt",), lists_images=True),
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
+    "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -341,7 +358,9 @@ OPTIONAL_KEYS = (
 )
 LISTS_OF_ANY_LENGTH = ("frames", "distortion")
 
-TIMES, COORDINATES, POLARITIES = ("t", "timestamp", "T_wc_timestamp"), ("x", "y", "position"), ("p", "polarity")
+TIMES, SECONDS_OF_EVENTS = ("t", "timestamp", "T_wc_timestamp"), ("dataset_events_t",)
+COORDINATES, POLARITIES = ("x", "y", "position", "dataset_events_xy"), ("p", "polarity", "dataset_events_p")
+NOT_READ = ("index", "discretization")
 ARRAYS_OF_ANY_LENGTH = ("rows", "poses_bounds", "distortion_params")
 
 OUTSIDE = (-1, 1280, 2**16 + 3, 2**31 + 3, 2**32 + 3, 2**40, -(2**32) + 3)
@@ -462,6 +481,13 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
     """A value of JSON or YAML."""
     load, dump = (yaml.safe_load, yaml.safe_dump) if path.suffix == ".yaml" else (json.loads, json.dumps)
     tree: Any = load(path.read_text(encoding="utf-8"))
+    outcome = damage_value(draw, tree)
+    path.write_text(dump(tree), encoding="utf-8")
+    return outcome
+
+
+def damage_value(draw: Draw, tree: Any) -> Outcome:
+    """One of nested values."""
     *above, key = draw(st.sampled_from(list(places_in(tree))))
     inside = tree
     for step in above:
@@ -487,7 +513,6 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
         inside[key] *= 2
         outcome = "refused or plain"
     note(repr(inside)[:200])
-    path.write_text(dump(tree), encoding="utf-8")
     return outcome
 
 
@@ -504,6 +529,7 @@ def kinds_of_damage(name: str, array: np.ndarray) -> list[str]:
     elif name in POLARITIES:
         kinds += ["p", "wider type"]
     elif array.dtype.kind == "f":
+        kinds += ["scaled", "unsorted"] * (name in SECONDS_OF_EVENTS)
         kinds += ["not finite"] + ["no rotation"] * (name == "T_wc_orientation")
         kinds += ["axes swapped"] * (name == "rectify_map")
     return kinds
@@ -566,11 +592,18 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         np.save(path, array)
         return "refused or plain" if path.parent.name == "depth" else outcome  # of which the shape is looked at
     if path.suffix == ".npz":
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=True) as file:
             arrays = dict(file)
         name, is_removed = draw(st.sampled_from(sorted(arrays))), draw(st.sampled_from([False] * 9 + [True]))
-        array, outcome = damage_array(draw, name, arrays.pop(name))
+        if arrays[name].dtype.hasobject:
+            tree = arrays.pop(name).item()
+            damage_value(draw, tree)
+            array, outcome = np.array(tree, dtype=object), "refused or plain"
+        else:
+            array, outcome = damage_array(draw, name, arrays.pop(name))
         np.savez(path, **arrays, **{} if is_removed else {name: array})
+        if name in NOT_READ:
+            return "refused or the same"
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
         group: Any = file["events"] if "events" in file else file
