@@ -31,6 +31,7 @@ import test_eds
 import test_esim_npz
 import test_event_recording
 import test_evimo2
+import test_mvsec
 import test_tum_vie
 import torch
 import yaml
@@ -45,7 +46,8 @@ from enerf_ns.dataparsers.formats.registry import _read_folder, formats, read_re
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import load_array, load_image
+from enerf_ns.dataparsers.recording.files import load_array
+from enerf_ns.dataparsers.recording.hdf5_files import load_picture
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -295,6 +297,23 @@ def plain_evimo2(folder: Path) -> Plain:
     return Plain(events, np.rint(poses[:, 0] * 1e9).astype(np.int64), matrices(poses[:, 1:4], poses[:, 4:]), none, none)
 
 
+def plain_mvsec(folder: Path) -> Plain:
+    def nanoseconds(seconds: np.ndarray) -> np.ndarray:
+        return np.array([round(Fraction(time) * 10**9) for time in seconds.tolist()], np.int64)
+
+    name = next(folder.glob("*_data.hdf5")).name.removesuffix("_data.hdf5")
+    with h5py.File(folder / f"{name}_data.hdf5", "r") as file:
+        left: Any = file["davis/left"]
+        rows, stamps = left["events"][...], nanoseconds(left["image_raw_ts"][...]) if "image_raw" in left else []
+    with h5py.File(folder / f"{name}_gt.hdf5", "r") as file:
+        left = file["davis/left"]
+        times, poses = nanoseconds(left["pose_ts"][...]), left["pose"][...]
+        begins = nanoseconds(left["depth_image_raw_ts"][:1]) if "depth_image_raw" in left else np.zeros(0, np.int64)
+    events = np.column_stack([rows[:, [0, 1, 3]].astype(np.int64), nanoseconds(rows[:, 2])])[:, [0, 1, 3, 2]]
+    stamps = np.array(stamps, np.int64)
+    return Plain(events, times, poses, stamps, np.array([min([*stamps[:1], *begins])]), starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -326,6 +345,7 @@ LAYOUTS = {
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
     "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2),
+    "mvsec": Layout("mvsec", test_mvsec.write_mvsec, plain_mvsec),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -336,7 +356,12 @@ Outcome = Literal["refused", "refused or the same", "the same", "refused or plai
 
 Draw = Callable[[st.SearchStrategy], Any]
 
-TABLES, TREES, ARRAYS, IMAGES = (".txt", ".conf"), (".json", ".yaml"), (".npy", ".npz", ".h5"), (".png", ".jpg")
+TABLES, TREES, ARRAYS, IMAGES = (
+    (".txt", ".conf"),
+    (".json", ".yaml"),
+    (".npy", ".npz", ".h5", ".hdf5"),
+    (".png", ".jpg"),
+)
 WITH_CHECKSUMS = (".npz", ".png")
 
 KINDS_OF_TABLES = {
@@ -606,6 +631,8 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
             return "refused or the same"
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
+        if "davis/left" in file:
+            return damage_mvsec(draw, file["davis/left"])
         group: Any = file["events"] if "events" in file else file
         name = draw(st.sampled_from([name for name in ("x", "y", "t", "p", "rectify_map") if name in group]))
         kind = draw(st.sampled_from(["removed", *["exchanged"] * (name in "xy"), *["changed"] * 8]))
@@ -620,6 +647,20 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
             return "refused"
         group[name], outcome = damage_array(draw, name, array)
         return outcome
+
+
+def damage_mvsec(draw: Draw, group: Any) -> Outcome:
+    """A dataset of one of the two files, of which "rows" are events x y t p."""
+    name = draw(st.sampled_from(sorted({"events", "image_raw", "image_raw_ts", "pose", "pose_ts"} & set(group))))
+    array = group[name][...]
+    del group[name]
+    if draw(st.sampled_from([False] * 9 + [True])):
+        return "refused or plain" if name == "image_raw" else "refused"
+    if name == "events":
+        array = array.astype(np.float64)
+    kind = {"events": "rows", "pose_ts": "seconds", "image_raw_ts": "seconds"}.get(name, name)
+    group[name], outcome = damage_array(draw, kind, array)
+    return "refused or plain" if name in ("image_raw_ts", "pose_ts", "pose", "image_raw", "events") else outcome
 
 
 def damage_image(draw: Draw, layout: Layout, path: Path) -> Outcome:
@@ -692,7 +733,7 @@ def facts(recording: EventRecording) -> dict[str, Any]:
         if frames is None:
             return None
         names = [str(file.relative_to(recording.path)) for file in frames.filenames]
-        pictures = [load_image(file) for file in frames.filenames]
+        pictures = [load_picture(file) for file in frames.filenames]
         depth = [load_array(file) for file in frames.depth_filenames or ()]
         return names, frames.times, frames.numbers, frames.camera, of_trajectory(frames.trajectory), pictures, depth
 
