@@ -108,6 +108,8 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "tum_vie_prepared": ("calib_undist.json", "mocap-imu-calib.json"),
             "esim_npz": ("camera_calibration.npz",),
             "esim_bag": ("esim.bag", "esim.conf"),
+            "mvsec": ("indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+            "vector": ("desk_normal1.synced.gt.txt", "camera_mocap_extrinsic_results1.yaml"),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),
         }.items()

@@ -28,7 +28,9 @@ import test_event_files
 import test_event_recording
 import test_files
 import test_fuzz
+import test_mvsec
 import test_tum_vie
+import test_vector
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
 from warm_commands import WarmCommands
@@ -104,6 +106,8 @@ FILES: dict[str, tuple[str, ...]] = {
     "davis": ("events.txt", "groundtruth.txt", "calib.txt", "images/frame_00000001.png"),
     "esim_npz": ("camera_calibration.npz", "camera_poses.npz", "raw_events.npz"),
     "esim_bag": ("esim.bag",),
+    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+    "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -155,6 +159,8 @@ def cases_of_tables() -> dict[str, Wrong]:
         "tum_vie_prepared": test_tum_vie.BAD_PREPARED,
         "small own": test_event_recording.BAD_FILES,
         "small npz": test_esim_npz.BAD_INPUT,
+        "mvsec": test_mvsec.BAD,
+        "vector": test_vector.BAD,
     }
     for whole, table in tables.items():
         for name, (fault, *said) in table.items():

@@ -37,7 +37,7 @@ from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile,
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
-from enerf_ns.dataparsers.formats.yaml_values import find_calibration, kalibr_camera, read_yaml
+from enerf_ns.dataparsers.formats.yaml_values import KALIBR_MODELS, find_calibration, kalibr_camera, read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, in_colour

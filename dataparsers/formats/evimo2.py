@@ -4,11 +4,14 @@
         dataset_events_t.npy                    (n,) or (n, 1) floats: seconds
         dataset_events_xy.npy                   (n, 2) whole numbers: column and row
         dataset_events_p.npy                    (n,) or (n, 1): 0 or 1; of samsung_mono, 1 is darker
+        dataset_depth.npz                       depth_0000000017 and so on: (res_y, res_x) uint16, millimetres, 0
+                                                without depth; the number is a place in meta['frames'] (optional)
         dataset_info.npz                        K (3, 3), D (4) and meta, a pickled dict, of which are read
             meta['meta']                        fx fy cx cy, k1 k2 k3 k4 p1 p2, res_x res_y, dist_model
             meta['full_trajectory'][i]          about 200 a second: 'cam' and the objects by number, each with 'ts'
                                                 (seconds) and 'pos': 't' x y z (metres) and 'q' w x y z; the camera to
                                                 the world, objects to the camera
+            meta['frames'][i]                   'ts' of a depth map (seconds) and its 'id'
 
 The pickle is read by `plain_pickle`, which runs nothing. The recording's clock is that of the files.
 
@@ -19,9 +22,13 @@ the centres of pixels. The reader takes them as such, as OpenCV's calibration do
 Direction of the poses: an object that stands still keeps its place in the world only if the poses lead from the camera
 to the world. The reader checks that, and names objects that move. Sequences of the category sfm stand still.
 
+Numbers of depth maps: the documents call them the 'id' of a frame, but in a published file they are its place in
+meta['frames'], as in the code that wrote it. They are read as places if all are below the number of frames, else as
+'id'. `enerf inspect` compares the depth maps with the events.
+
 The instants without Vicon poses are missing in `full_trajectory`, and are gaps of the poses. The world is the pose of
 the camera at the start, so that worlds of two cameras differ. The data set does not publish where the frame camera
-flea3_7 is mounted, so its frames are not read, and neither are depth maps, masks and inertial measurements.
+flea3_7 is mounted, so its frames are not read, and neither are masks and inertial measurements.
 
 Burner, Mitrokhin, Fermüller, Aloimonos, "EVIMO2", 2022; https://better-flow.github.io/evimo/download_evimo_2.html.
 """
@@ -29,6 +36,7 @@ Burner, Mitrokhin, Fermüller, Aloimonos, "EVIMO2", 2022; https://better-flow.gi
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -49,10 +57,11 @@ from enerf_ns.dataparsers.formats.text_tables import MOST_ROWS
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError, printable, shortened
 from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, check_npy_header, load_array, of_file, reading
-from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events
+from enerf_ns.dataparsers.recording.hdf5_files import load_depth_map
+from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
-INFO = "dataset_info.npz"
+INFO, DEPTH = "dataset_info.npz", "dataset_depth.npz"
 COLUMNS = {"t": "dataset_events_t.npy", "xy": "dataset_events_xy.npy", "p": "dataset_events_p.npy"}
 FILES = (*COLUMNS.values(), INFO)
 
@@ -106,17 +115,19 @@ def read(
     _check_times(info, times)
     quaternions = unit_quaternions(info, positions, quaternions, notes, lambda row: f"pose {row + 1} of the camera")
     _check_still(info, instants, notes)
+    trajectory = Trajectory(times, positions, quaternions)
     with of_file(info):
         return EventRecording(
             path=folder,
             format="evimo2",
             camera=camera,
-            trajectory=Trajectory(times, positions, quaternions),
+            trajectory=trajectory,
             stream_events=events.stream,
             event_files=tuple(folder / name for name in COLUMNS.values()),
+            depth_maps=_read_depth_maps(folder / DEPTH, meta["frames"], camera, trajectory),
             notes=tuple(notes),
             num_events=events.num_events,
-            times_in={"events": (folder / COLUMNS["t"], "s"), "poses": (info, "s")},
+            times_in={"events": (folder / COLUMNS["t"], "s"), "poses": (info, "s"), "depth maps": (info, "s")},
         )
 
 
@@ -286,6 +297,40 @@ def _check_times(path: Path, times: Int64[np.ndarray, " poses"]) -> None:
             f"{path}, pose {row + 1} of the camera has the time {times[row] * 1e-9:.6f} s, which is not after that of "
             "the pose before; times must increase."
         )
+
+
+def _read_depth_maps(path: Path, frames: Value, camera: Camera, trajectory: Trajectory) -> Frames | None:
+    """Returns the instants with depth maps; None if there are none."""
+    if not path.exists():
+        return None
+    with reading(path, EXPECTED), ZipFile(path) as archive:
+        found = (re.fullmatch(r"depth_(\d{1,20})\.npy", name) for name in archive.namelist())
+        names = {int(match[1]): path / match[0].removesuffix(".npy") for match in found if match}
+    if not names:
+        return None
+    instants = frames.values()
+    if max(names) < len(instants):
+        at = {number: instants[number] for number in names}
+    else:
+        by_id = {instant["id"].found: instant for instant in instants}
+        if missing := sorted(names.keys() - by_id.keys()):
+            raise RecordingError(
+                f"{path} holds the depth map {names[missing[0]].name}, but {frames.name} holds {len(instants):,} "
+                "frames, and none with this number; unpack both again."
+            )
+        at = {number: by_id[number] for number in names}
+    numbers = sorted(names)
+    seconds = np.array([float(at[number]["ts"].numbers(())) for number in numbers])
+    if not (np.abs(seconds) < LATEST * 1e-9).all() or not (np.diff(seconds) > 0).all():
+        raise RecordingError(f"{frames.path} holds times of depth maps in {frames.name} that do not increase.")
+    files = tuple(names[number] for number in numbers)
+    shape = load_depth_map(files[0]).shape
+    if shape != (camera.height, camera.width):
+        raise RecordingError(
+            f"{path} holds {files[0].name} of shape {shape}, but (res_y, res_x) = {(camera.height, camera.width)} was "
+            "expected; unpack it again."
+        )
+    return Frames(files, np.rint(seconds * 1e9).astype(np.int64), camera, trajectory, files)
 
 
 def _check_still(path: Path, instants: list[Value], notes: list[str]) -> None:

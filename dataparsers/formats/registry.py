@@ -12,7 +12,18 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, evimo2, mvsec, tum_vie
+from enerf_ns.dataparsers.formats import (
+    davis,
+    eds,
+    esim,
+    esim_bag,
+    esim_npz,
+    event_recording,
+    evimo2,
+    mvsec,
+    tum_vie,
+    vector,
+)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
@@ -125,7 +136,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, evimo2, mvsec, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, evimo2, mvsec, vector, event_recording):
     register(_module.FORMAT)
 
 

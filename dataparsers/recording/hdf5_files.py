@@ -1,7 +1,8 @@
-"""Reads HDF5 files that may come from anybody, and pictures and depth maps within them.
+"""Reads HDF5 files that may come from anybody, and pictures and depth maps within them and within .npz files.
 
 A path beyond the file names a picture: data.hdf5/davis/left/image_raw/17 is the picture number 17, from 0, of the
-dataset davis/left/image_raw [pictures, height, width] in data.hdf5.
+dataset davis/left/image_raw [pictures, height, width] in data.hdf5; depth.npz/depth_17 is the array depth_17 [height,
+width] in depth.npz.
 """
 
 from __future__ import annotations
@@ -9,12 +10,20 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Float32, Shaped
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, is_deep, load_depth, load_image, reading
+from enerf_ns.dataparsers.recording.files import (
+    LARGEST_ARRAY,
+    check_npy_header,
+    is_deep,
+    load_depth,
+    load_image,
+    reading,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -26,11 +35,11 @@ file states fewer."""
 LARGEST_CHUNK = 2**27
 """Most bytes of a chunk, which HDF5 decompresses as a whole."""
 
-SUFFIXES = (".hdf5", ".h5")
+SUFFIXES = (".hdf5", ".h5", ".npz")
 
 
 def file_of(path: Path) -> Path:
-    """Returns the file that holds a picture: the path itself, or the HDF5 file that it leads into."""
+    """Returns the file that holds a picture: the path itself, or the HDF5 or .npz file that it leads into."""
     return next((above for above in path.parents if above.suffix in SUFFIXES and above.is_file()), path)
 
 
@@ -40,7 +49,12 @@ def load_picture(path: Path) -> Shaped[np.ndarray, "height width channels"]:
     Raises:
         RecordingError: The file is missing or cannot be read.
     """
-    return load_image(path) if file_of(path) == path else _load(path, "u", 1)[..., None]
+    if file_of(path) == path:
+        return load_image(path)
+    picture = _load(path)
+    if picture.dtype != np.uint8:
+        raise RecordingError(f"{path} holds a picture of {picture.dtype}, but 8 bits were expected; read it again.")
+    return picture[..., None]
 
 
 def is_deep_picture(path: Path) -> bool:
@@ -49,14 +63,17 @@ def is_deep_picture(path: Path) -> bool:
 
 
 def load_depth_map(path: Path) -> Float32[np.ndarray, "height width"]:
-    """Returns what `load_depth` returns, also of a depth map in an HDF5 file, where NaN is unknown.
+    """Returns what `load_depth` returns, also of a depth map in an HDF5 or .npz file.
+
+    There, whole numbers are millimetres, and 0 is unknown; floats are metres, and NaN is unknown, too.
 
     Raises:
         RecordingError: The file is missing or cannot be read, or a depth is negative.
     """
     if file_of(path) == path:
         return load_depth(path)
-    depth = _load(path, "f", 8).astype(np.float32)
+    stored = _load(path)
+    depth = stored.astype(np.float32) * np.float32(1e-3 if stored.dtype.kind == "u" else 1)
     depth[~np.isfinite(depth)] = 0
     if (depth < 0).any():
         raise RecordingError(
@@ -65,18 +82,40 @@ def load_depth_map(path: Path) -> Float32[np.ndarray, "height width"]:
     return depth
 
 
-def _load(path: Path, kind: str, largest_number: int) -> np.ndarray:
-    """Returns a picture whose numbers are of a kind and have at most so many bytes."""
-    import h5py
-    import hdf5plugin  # noqa: F401  makes the filters known
-
+def _load(path: Path) -> np.ndarray:
     source = file_of(path)
-    *names, number = path.relative_to(source).parts
-    with reading(source, "an HDF5 file with pictures"), h5py.File(source, "r", locking=False) as file:
-        dataset = dataset_in(source, file, "/".join(names))
-        if dataset.dtype.kind != kind or dataset.dtype.itemsize > largest_number:
-            raise RecordingError(f"{source} holds other values in {dataset.name} than before; read it again.")
-        return dataset[int(number)]
+    *names, last = path.relative_to(source).parts
+    with reading(source, "a file with pictures"):
+        if source.suffix == ".npz":
+            return _load_from_npz(source, last)
+        import h5py
+        import hdf5plugin  # noqa: F401  makes the filters known
+
+        with h5py.File(source, "r", locking=False) as file:
+            dataset = dataset_in(source, file, "/".join(names))
+            _checked(source, dataset.dtype, dataset.shape[1:])
+            return dataset[int(last)]
+
+
+def _load_from_npz(source: Path, name: str) -> np.ndarray:
+    with ZipFile(source) as archive, archive.open(f"{name}.npy") as member:
+        check_npy_header(member)
+        major, _ = np.lib.format.read_magic(member)
+        header = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, by_column, kind = header(member)
+        _checked(source, kind, shape)
+        content = member.read(math.prod(shape) * kind.itemsize)
+        return np.frombuffer(content, kind).reshape(shape, order="F" if by_column else "C")
+
+
+def _checked(source: Path, kind: np.dtype, shape: tuple[int, ...]) -> None:
+    """Checks that an array is a picture before it is read."""
+    size = math.prod(shape) * kind.itemsize
+    if kind.kind not in "uf" or len(shape) != 2 or size > LARGEST_ARRAY:
+        raise RecordingError(
+            f"{source} holds a picture as {kind} of shape {shape}, but numbers [height, width] of at most "
+            f"{LARGEST_ARRAY:,} bytes were expected; read it again."
+        )
 
 
 def dataset_in(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
@@ -98,10 +137,6 @@ def dataset_in(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     if not isinstance(found, h5py.Dataset):
         raise RecordingError(f"{path} lacks the dataset {name}, which was expected; give a file that holds it.")
     check_filters(path, found)
-    if len(found.shape) > 2 and (size := math.prod(found.shape[1:]) * found.dtype.itemsize) > LARGEST_ARRAY:
-        raise RecordingError(
-            f"{path} holds pictures of {size:,} bytes in {name}, but at most {LARGEST_ARRAY:,} were expected."
-        )
     return found
 
 

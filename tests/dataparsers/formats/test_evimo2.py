@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -76,7 +77,8 @@ class Scene:
         instants.insert(60, {"id": 7, "ts": float(self.times[60] - 1e-3)})  # one without a pose
         imu = {"/prophesee/left/imu": [{"angular_velocity": {"x": 0.1}, "ts": 2.0}]}
         cam = copy.deepcopy(instants[0]["cam"])
-        frames = [{"ts": 2.0, "id": 1765, "cam": cam, "gt_frame": "depth_mask_1765.png"}]
+        frames: list[dict[str, Any]] = [{"ts": 2.0, "id": 1765, "cam": cam, "gt_frame": "depth_mask_1765.png"}]
+        frames += [{"ts": 2.0 + i / 60, "id": 1765 + i} for i in range(1, 30)]
         return {"frames": frames, "full_trajectory": instants, "imu": imu, "meta": self.meta}
 
 
@@ -103,7 +105,19 @@ def write_evimo2(folder: Path, scene: Scene | None = None, dtype: type = np.floa
     np.save(folder / "dataset_events_xy.npy", scene.xy)
     np.save(folder / "dataset_events_p.npy", scene.p[:, None] if column else scene.p)
     write_info(folder, scene)
+    np.savez_compressed(folder / "dataset_depth.npz", **{f"depth_{i:010d}": depth_map(i) for i in DEPTH_MAPS})
     return folder
+
+
+DEPTH_MAPS = (0, 7, 24)
+"""Places in meta["frames"] with depth."""
+
+
+def depth_map(number: int) -> np.ndarray:
+    """Millimetres; 0 without depth."""
+    depth = np.random.default_rng(number).integers(300, 2000, (HEIGHT, WIDTH)).astype(np.uint16)
+    depth[:5] = 0
+    return depth
 
 
 def place_of(camera: str, above: Path) -> Path:
@@ -170,6 +184,28 @@ def test_instants_without_poses_are_a_gap(tmp_path: Path):
     assert len(index_events(recording)) == NUM_EVENTS
 
 
+@pytest.mark.parametrize("by_id", [False, True])
+def test_depth_maps_are_metres_at_their_instants(tmp_path: Path, by_id: bool):
+    """Against OpenCV's map of the pixels without distortion."""
+    folder = write_evimo2(place_of("left_camera", tmp_path))
+    if by_id:
+        np.savez(folder / "dataset_depth.npz", **{f"depth_{1765 + i:010d}": depth_map(i) for i in DEPTH_MAPS})
+    maps = read(folder).depth_maps
+    assert maps is not None
+    np.testing.assert_array_equal(maps.times, [round((2.0 + i / 60) * 1e9) for i in DEPTH_MAPS])
+    matrix = np.array([[LENS["fx"], 0, LENS["cx"]], [0, LENS["fy"], LENS["cy"]], [0, 0, 1]])
+    lens = np.array([LENS["k1"], LENS["k2"], *TANGENTIAL.values()])
+    new = maps.picture_camera.matrix
+    x, y = cv2.initUndistortRectifyMap(matrix, lens, np.eye(3), new, (WIDTH, HEIGHT), cv2.CV_32FC1)
+    for number, place in enumerate(DEPTH_MAPS):
+        expected = cv2.remap(depth_map(place), x, y, cv2.INTER_NEAREST) / 1000
+        found = maps.depth(number)
+        assert found is not None
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    (folder / "dataset_depth.npz").unlink()
+    assert read(folder).depth_maps is None
+
+
 def test_poses_of_the_wrong_direction_are_named(tmp_path: Path):
     """By objects that stand still."""
     scene = make_scene()
@@ -202,8 +238,7 @@ def test_coarse_times_are_noted(tmp_path: Path):
     scene.t, scene.times = scene.t + 30, scene.times + 30
     folder = write_evimo2(place_of("left_camera", tmp_path), scene, np.float32)
     recording = read(folder)
-    (note,) = recording.notes
-    assert note.startswith("The times of the events are stored as float32, in steps of 3.8 µs at 33.2")
+    assert recording.notes[0].startswith("The times of the events are stored as float32, in steps of 3.8 µs at 33.2")
     np.testing.assert_array_equal(
         joined(recording.stream_events()).t, np.rint(scene.t.astype(np.float32).astype(np.float64) * 1e9)
     )
@@ -245,7 +280,15 @@ def other_matrix(folder: Path) -> None:
     write_info(folder, scene, written)
 
 
+def saved_depth(name: str, depth: np.ndarray) -> Callable[[Path], None]:
+    return lambda folder: np.savez(folder / "dataset_depth.npz", **{name: depth})
+
+
 BAD: dict[str, tuple] = {
+    "depth of another size": (saved_depth("depth_1", np.zeros((4, 5), np.uint16)), "depth_1 of shape (4, 5), but"),
+    "depth in colour": (saved_depth("depth_1", np.zeros((4, 5, 3), np.uint16)), "uint16 of shape (4, 5, 3), but num"),
+    "depth of objects": (saved_depth("depth_1", np.array([[None]])), "holds a picture as object of shape (1, 1)"),
+    "depth without an instant": (saved_depth("depth_99", depth_map(0)), "depth map depth_99, but meta.frames holds 30"),
     "no times": (lambda folder: (folder / "dataset_events_t.npy").unlink(), "dataset_events_t.npy is missing"),
     "whole times": (saved("t", lambda t: t.astype(int)), "_t.npy holds int64 of shape (1200,), but one number of sec"),
     "fewer places": (saved("xy", lambda xy: xy[:-1]), "1,199 dataset_events_xy.npy"),

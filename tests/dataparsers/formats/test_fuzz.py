@@ -33,6 +33,7 @@ import test_event_recording
 import test_evimo2
 import test_mvsec
 import test_tum_vie
+import test_vector
 import torch
 import yaml
 from hypothesis import HealthCheck, given, note, settings
@@ -314,6 +315,25 @@ def plain_mvsec(folder: Path) -> Plain:
     return Plain(events, times, poses, stamps, np.array([min([*stamps[:1], *begins])]), starts_at_zero=False)
 
 
+def plain_vector(folder: Path) -> Plain:
+    name = next(folder.glob("*.hdf5")).name.removesuffix(".synced.left_event.hdf5")
+    path = folder / f"{name}.synced.left_event.hdf5"
+    with h5py.File(path, "r") as file:
+        offset = int(np.asarray(file["t_offset"]).item()) * 1000 if "t_offset" in file else 0
+    body, joint = (
+        yaml.safe_load((folder / file).read_text(encoding="utf-8-sig"))
+        for file in ("camera_mocap_extrinsic_results1.yaml", "small_scale_joint_camera_extrinsic_results.yaml")
+    )
+    matrices = [np.array(body["cam0"]["T_cam_body"]).reshape(4, 4), np.array(joint["cam2"]["T_cam0_cam2"])]
+    mount = np.linalg.inv(matrices[0]) @ matrices[1].reshape(4, 4)
+    times, poses = poses_in(folder / f"{name}.synced.gt.txt", "s")
+    stamps = folder / f"{name}.synced.left_camera/timestamp.txt"
+    rows = rows_of(stamps) if stamps.exists() else []
+    opens, closes = (times_in([row[i:] for row in rows], "s") for i in (0, 1))
+    events = hdf5_events(path) + np.array([0, 0, offset, 0])
+    return Plain(events, times, poses @ mount, opens + (closes - opens) // 2, opens, starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -344,8 +364,9 @@ LAYOUTS = {
     "davis": Layout("davis", write_small_davis, plain_davis, ("images.txt",), lists_images=True),
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
-    "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2),
+    "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2, ("dataset_depth.npz",)),
     "mvsec": Layout("mvsec", test_mvsec.write_mvsec, plain_mvsec),
+    "vector": Layout("vector", test_vector.write_vector, plain_vector),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -365,8 +386,8 @@ TABLES, TREES, ARRAYS, IMAGES = (
 WITH_CHECKSUMS = (".npz", ".png")
 
 KINDS_OF_TABLES = {
-    "poses": ("*groundtruth*", "*poses*", "mocap_data.txt"),
-    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt"),
+    "poses": ("*groundtruth*", "*poses*", "mocap_data.txt", "*.gt.txt"),
+    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt", "timestamp.txt"),
     "events": ("events.txt",),
     "exposures": ("image_exposures*",),
     "others": ("*",),
@@ -381,7 +402,7 @@ OPTIONAL_KEYS = (
     *("camera", "frame_camera", "event_camera_from_frame_camera", "contrast_thresholds", "depth_range"),
     *("refractory_period_ns", "bayer_pattern"),
 )
-LISTS_OF_ANY_LENGTH = ("frames", "distortion")
+LISTS_OF_ANY_LENGTH = ("frames", "distortion", "data")
 
 TIMES, SECONDS_OF_EVENTS = ("t", "timestamp", "T_wc_timestamp"), ("dataset_events_t",)
 COORDINATES, POLARITIES = ("x", "y", "position", "dataset_events_xy"), ("p", "polarity", "dataset_events_p")
@@ -627,7 +648,7 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         else:
             array, outcome = damage_array(draw, name, arrays.pop(name))
         np.savez(path, **arrays, **{} if is_removed else {name: array})
-        if name in NOT_READ:
+        if name in NOT_READ or path.name == "dataset_depth.npz":
             return "refused or the same"
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
