@@ -318,7 +318,16 @@ def _split_frames(recording: EventRecording, config: EventDataParserConfig, held
 
 
 def event_pictures(recording: EventRecording) -> Frames:
-    """Instants along the trajectory, for a recording without frames. Their file names stand for no files."""
+    """Instants along the trajectory, for a recording without frames. Their file names stand for no files.
+
+    They are those of depth maps if the recording has some.
+    """
+    maps = recording.depth_maps
+    if maps is not None:
+        known = np.flatnonzero(maps.trajectory.covers(maps.times) & ~recording.in_left_out_gaps(maps.times))
+        chosen = np.unique(np.linspace(0, len(known) - 1, NUM_EVENT_PICTURES).round().astype(int))
+        if len(known):
+            return maps.subset(known[chosen])
     times = recording.instants(NUM_EVENT_PICTURES + 2)[1:-1]
     names = tuple(recording.path / f"events_{i:05d}.png" for i in range(len(times)))
     return Frames(filenames=names, times=times, camera=recording.camera, trajectory=recording.trajectory)

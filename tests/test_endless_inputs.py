@@ -110,6 +110,8 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "esim_bag": ("esim.bag", "esim.conf"),
             "llff_events": ("all_poses_bounds.npy", "all_timestamps.npy", "images_1/timestamps.npz", "events.h5"),
             "eventnerf": ("train/events/test.npz", "train/pose/r_00000.txt", "train/intrinsics/r_00003.txt"),
+            "mvsec": ("indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+            "vector": ("desk_normal1.synced.gt.txt", "camera_mocap_extrinsic_results1.yaml"),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),
         }.items()

@@ -124,7 +124,8 @@ def test_constraints_hold_on_the_first_release_of_each_python():
 def test_entry_points_are_specifications():
     assert {point.name for point in ENTRY_POINTS} >= {
         "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
-        "tumvie-events", "eventnerf-events", "llff-events", "event-recording", *PUBLISHED_LOSSES,
+        "tumvie-events", "eventnerf-events", "llff-events", "evimo2-events", "mvsec-events", "vector-events",
+        "event-recording", *PUBLISHED_LOSSES,
     }  # fmt: skip
     for point in ENTRY_POINTS:
         assert type(point.load()).__name__ == SPECIFICATIONS[point.group]

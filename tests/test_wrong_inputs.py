@@ -30,7 +30,9 @@ import test_eventnerf
 import test_files
 import test_fuzz
 import test_llff_events
+import test_mvsec
 import test_tum_vie
+import test_vector
 from recordings import write_davis, write_esim
 from test_bad_input import is_one_sentence
 from warm_commands import WarmCommands
@@ -120,6 +122,8 @@ FILES: dict[str, tuple[str, ...]] = {
         "images_1/timestamps.npz",
         "images_1/01.png",
     ),
+    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+    "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -173,6 +177,8 @@ def cases_of_tables() -> dict[str, Wrong]:
         "small npz": test_esim_npz.BAD_INPUT,
         "eventnerf": test_eventnerf.BAD_INPUT,
         "llff_events": test_llff_events.BAD_INPUT,
+        "mvsec": test_mvsec.BAD,
+        "vector": test_vector.BAD,
     }
     for whole, table in tables.items():
         for name, (fault, *said) in table.items():

@@ -69,6 +69,9 @@ def write_recording(recording: EventRecording, folder: Path) -> list[str]:
     if recording.held_out_frames is not None:
         views = len(recording.held_out_frames.times)
         sentences.insert(0, f"{views:,} held-out views are left out, since they lie on a trajectory of their own.")
+    if recording.depth_maps is not None:
+        maps = len(recording.depth_maps.times)
+        sentences.insert(0, f"{maps:,} depth maps are left out, since the layout holds those at the times of frames.")
     return sentences
 
 

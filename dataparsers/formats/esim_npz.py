@@ -23,13 +23,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
 
 from enerf_ns.dataparsers.formats.columns import check_lengths, check_times
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.npz_arrays import EXPECTED, Form, StoredArray, open_arrays
+from enerf_ns.dataparsers.formats.npz_arrays import EXPECTED, Form, StoredArray, load_arrays, open_arrays
 from enerf_ns.dataparsers.formats.robust_enerf import (
     checked_camera,
     checked_trajectory,
@@ -79,18 +78,13 @@ def read(folder: Path) -> EventRecording:
         )
 
 
-def _load(path: Path, arrays: dict[str, Form]) -> list[np.ndarray]:
-    with reading(path, EXPECTED), ZipFile(path) as archive:
-        return [StoredArray(path, archive, name, *form).whole() for name, form in arrays.items()]
-
-
 def _read_trajectory(path: Path, notes: list[str]) -> Trajectory:
     forms = {
         "T_wc_timestamp": ("integers", (None,)),
         "T_wc_position": ("numbers", (None, 3)),
         "T_wc_orientation": ("numbers", (None, 4)),
     }
-    times, positions, quaternions = _load(path, forms)
+    times, positions, quaternions = load_arrays(path, forms)
     check_lengths(path, {"times": len(times), "positions": len(positions), "orientations": len(quaternions)})
     check_times(path, times)
     return checked_trajectory(
@@ -107,7 +101,7 @@ def _read_calibration(path: Path) -> tuple[Camera, tuple[float, float], int, str
         "distortion_model": ("text", ()),
         "bayer_pattern": ("text", ()),
     }
-    *scalars, matrix, distortion, model, pattern = _load(path, forms)
+    *scalars, matrix, distortion, model, pattern = load_arrays(path, forms)
     width, height, on, off, refractory_period = (float(scalar) for scalar in scalars)
     model, pattern = (_text(text) for text in (model, pattern))
     camera = checked_camera(path, width, height, matrix, model, distortion)

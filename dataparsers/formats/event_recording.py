@@ -57,11 +57,10 @@ from enerf_ns.dataparsers.recording.files import (
     check_is_folder,
     is_deep,
     load_array,
-    load_depth,
-    load_image,
     of_file,
     write_whole,
 )
+from enerf_ns.dataparsers.recording.hdf5_files import file_of, is_deep_picture, load_depth_map, load_picture
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, LARGEST_GAMMA, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -156,7 +155,7 @@ def write(recording: EventRecording, folder: Path) -> int:
     if any(camera != frame_cameras[0] for camera in frame_cameras):
         raise RecordingError(f"{recording.path} holds sharp and blurred frames of two cameras, but one was expected.")
     frame_camera = frame_cameras[0] if frame_cameras else None
-    deep = [frames for frames in kinds.values() if frames is not None and is_deep(frames.filenames[0])]
+    deep = [frames for frames in kinds.values() if frames is not None and is_deep_picture(frames.filenames[0])]
     white_level = deep[0].white_level if deep else None
     about = _encode_about(
         *(recording.camera, frame_camera, recording, recording.depth_range),
@@ -423,16 +422,22 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
     digits = max(5, len(str(frames.numbers[-1])))
     names = [f"{number:0{digits}d}" for number in frames.numbers.tolist()]
     for name, source in zip(names, frames.filenames, strict=True):
-        load_image(source)  # raises RecordingError if it is damaged
-        shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
+        picture = load_picture(source)  # raises RecordingError if it is damaged
+        if file_of(source) == source:
+            shutil.copyfile(source, folder / f"{name}{source.suffix.lower()}")
+        else:
+            Image.fromarray(picture[..., 0]).save(folder / f"{name}.png")
     (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
     if frames.exposures is not None:
         (folder / EXPOSURES_NAME).write_text("".join(f"{exposure}\n" for exposure in frames.exposures.tolist()))
     if frames.depth_filenames and folder.name == "frames":
         depth_folder.mkdir()
         for name, source in zip(names, frames.depth_filenames, strict=True):
-            load_depth(source)  # raises RecordingError if it is no depth map
-            shutil.copyfile(source, depth_folder / f"{name}.npy")
+            depth = load_depth_map(source)  # raises RecordingError if it is no depth map
+            if file_of(source) == source:
+                shutil.copyfile(source, depth_folder / f"{name}.npy")
+            else:
+                np.save(depth_folder / f"{name}.npy", depth)
 
 
 def _parse_white_level(about: Value) -> float | None:

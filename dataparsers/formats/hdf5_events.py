@@ -10,7 +10,6 @@ The columns lie in the group events/ or at the root. This module also reads the 
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -24,6 +23,7 @@ from enerf_ns.dataparsers.formats.columns import check_columns, check_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
+from enerf_ns.dataparsers.recording.hdf5_files import check_filters, member
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
 from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, Times
 
@@ -32,15 +32,8 @@ if TYPE_CHECKING:
 
 COLUMNS = ("x", "y", "t", "p")
 
-BLOSC_FILTERS, BLOSC_PARAMETERS = (32001, 32026), 4
-"""HDF5 numbers of Blosc and Blosc2, and their least number of parameters. These filters end the process if a damaged
-file states fewer."""
-
 METADATA_BYTES = 2**17
 """Bytes that one addition to a file may need beside its events."""
-
-LARGEST_CHUNK = 2**27
-"""Most bytes of a chunk, which HDF5 decompresses as a whole."""
 
 SMALLEST_CACHE = 2**20
 """Least bytes of cache for decompressed chunks that are not used up."""
@@ -73,7 +66,7 @@ class Hdf5Events:
         with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
             for column in columns.values():
-                _check_filters(self.path, column)
+                check_filters(self.path, column)
             check_columns(self.path, columns, unit, floats)
             self._offset = self._read_offset(file)
             self._cache = max(SMALLEST_CACHE, *(_chunk_bytes(column) for column in columns.values()))
@@ -120,13 +113,13 @@ class Hdf5Events:
     def _columns(self, file: h5py.File) -> dict[str, h5py.Dataset]:
         import h5py
 
-        group = _member(self.path, file, "events")
+        group = member(self.path, file, "events")
         group = file if group is None else group
         if not isinstance(group, h5py.Group):
             raise RecordingError(
                 f"{self.path} holds a dataset events, but a group of the datasets x, y, t, p was expected."
             )
-        columns = {name: _member(self.path, group, name) for name in COLUMNS}
+        columns = {name: member(self.path, group, name) for name in COLUMNS}
         missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
         if missing:
             where = "its group events/" if group.name == "/events" else "its root"
@@ -137,16 +130,16 @@ class Hdf5Events:
         return columns  # type: ignore[return-value]
 
     def _read_offset(self, file: h5py.File) -> int:
-        member = _member(self.path, file, "t_offset")
-        if member is None:
+        offset = member(self.path, file, "t_offset")
+        if offset is None:
             return 0
         import h5py
 
-        if not isinstance(member, h5py.Dataset) or member.dtype.kind not in "iu" or member.size != 1:
-            found = f"{member.dtype} of shape {member.shape}" if isinstance(member, h5py.Dataset) else "no dataset"
+        if not isinstance(offset, h5py.Dataset) or offset.dtype.kind not in "iu" or offset.size != 1:
+            found = f"{offset.dtype} of shape {offset.shape}" if isinstance(offset, h5py.Dataset) else "no dataset"
             raise RecordingError(f"{self.path} holds t_offset as {found}, but one integer (µs) was expected.")
-        _check_filters(self.path, member)
-        return int(np.asarray(member).reshape(()))
+        check_filters(self.path, offset)
+        return int(np.asarray(offset).reshape(()))
 
     def _times(self, column: h5py.Dataset, start: int, stop: int, zero: int) -> np.ndarray:
         """Returns the times of some events, nanoseconds from `zero`."""
@@ -183,7 +176,7 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
 
     height, width = undistorted.height, undistorted.width
     with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
-        dataset = _member(path, file, "rectify_map")
+        dataset = member(path, file, "rectify_map")
         if not isinstance(dataset, h5py.Dataset):
             raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
         if dataset.dtype.kind != "f" or dataset.shape != (height, width, 2):
@@ -191,7 +184,7 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
                 f"{path} holds rectify_map as {dataset.dtype} of shape {dataset.shape}, but floats of shape "
                 f"{(height, width, 2)} were expected: x, y of each pixel of the sensor."
             )
-        _check_filters(path, dataset)
+        check_filters(path, dataset)
         rectify_map = dataset[...].astype(np.float32)
     if not np.isfinite(rectify_map).all():
         raise RecordingError(f"{path} holds a rectify_map with numbers that are not finite; make it again.")
@@ -204,51 +197,6 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
     directions = (rectify_map.astype(np.float64) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     with of_file(path):
         return replace(undistorted, model="lookup", directions=directions)
-
-
-def _member(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
-    """Returns the member of a group with this name, or None.
-
-    Raises:
-        RecordingError: The member is a link, external storage or a virtual dataset. A hostile file could name another
-            file of the user's disk in this way.
-    """
-    import h5py
-
-    link = group.get(name, getlink=True)
-    if link is None:
-        return None
-    member = group[name] if isinstance(link, h5py.HardLink) else None
-    if member is None or (isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)):
-        raise RecordingError(
-            f"{path} refers for {name} to another place, such as another file, and that is not followed; repack the "
-            "file with the data in it."
-        )
-    return member
-
-
-def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
-    import h5py
-
-    properties = dataset.id.get_create_plist()
-    if dataset.chunks and (size := math.prod(dataset.chunks) * dataset.dtype.itemsize) > LARGEST_CHUNK:
-        raise RecordingError(
-            f"{path} holds {dataset.name} in chunks of {size:,} bytes, each of which is read as a whole, but at most "
-            f"{LARGEST_CHUNK:,} were expected; repack the file with smaller chunks."
-        )
-    for i in range(properties.get_nfilters()):
-        number, _, parameters, name = properties.get_filter(i)
-        if not h5py.h5z.filter_avail(number):
-            called = f" ({name.decode(errors='replace')!r})" if name else ""
-            raise RecordingError(
-                f"{path} is compressed by the HDF5 filter {number}{called}, which is neither in h5py nor in "
-                "hdf5plugin; install its plugin and set HDF5_PLUGIN_PATH, or repack the file without it."
-            )
-        if number in BLOSC_FILTERS and len(parameters) < BLOSC_PARAMETERS:
-            raise RecordingError(
-                f"{path} is compressed by the HDF5 filter {number} (Blosc) and lacks its parameters; copy it again "
-                "from its source."
-            )
 
 
 def _chunk_bytes(dataset: h5py.Dataset) -> int:

@@ -101,3 +101,13 @@ def open_arrays(path: Path, forms: Mapping[str, Form], stack: ExitStack) -> list
             arrays.append(StoredArray(path, archive, name, *form))
             stack.callback(arrays[-1].close)
     return arrays
+
+
+def load_arrays(path: Path, forms: Mapping[str, Form]) -> list[np.ndarray]:
+    """Returns arrays of a file by name, as a whole.
+
+    Raises:
+        RecordingError: The file is missing or damaged, lacks an array of this form, or one is too large.
+    """
+    with reading(path, EXPECTED), ZipFile(path) as archive:
+        return [StoredArray(path, archive, name, *form).whole() for name, form in forms.items()]

@@ -20,10 +20,14 @@ from enerf_ns.dataparsers.formats import (
     esim_npz,
     event_recording,
     eventnerf,
+    evimo2,
     llff_events,
+    mvsec,
     tum_vie,
+    vector,
 )
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
@@ -134,7 +138,10 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, eventnerf, llff_events, event_recording):
+for _module in (
+    *(esim, esim_npz, esim_bag, davis, eds, tum_vie, eventnerf, llff_events, evimo2, mvsec, vector),
+    event_recording,
+):
     register(_module.FORMAT)
 
 
@@ -170,7 +177,7 @@ def _check_options(path: Path, found: Format, options: dict[str, object]) -> Non
         having = [format.name for format in formats() if option in (field.name for field in fields(format.options))]
         if found.name not in having:
             flag = f"--{option.replace('_', '-')}"
-            whose = f"is for recordings of {' and '.join(having)}" if having else "is no option of any format"
+            whose = f"is for recordings of {in_words(having)}" if having else "is no option of any format"
             raise FlagError(f"{flag} {whose}, but {path} is read as {found.name}; leave it out.")
 
 

@@ -14,6 +14,7 @@ from rich.progress import track
 from enerf_ns.dataparsers.index.index_cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import OutputError
 from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.dataparsers.recording.hdf5_files import file_of
 from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import Frames
 
@@ -41,7 +42,7 @@ def write_pictures(frames: Frames) -> list[Path]:
     for i in track(
         missing, "Writing undistorted pictures", transient=True, disable=not missing or not get_console().is_terminal
     ):
-        picture, state = in_8_bits(frames.picture(i)), frames.filenames[i].stat()
+        picture, state = in_8_bits(frames.picture(i)), file_of(frames.filenames[i]).stat()
         encoded = cv2.imencode(".png", picture[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
         try:
             write_whole(places[i], encoded)
@@ -65,4 +66,5 @@ def _place(frames: Frames, source: Path) -> Path:
 
 
 def _is_current(place: Path, source: Path) -> bool:
+    source = file_of(source)
     return place.exists() and source.exists() and place.stat().st_mtime_ns == source.stat().st_mtime_ns

@@ -183,7 +183,7 @@ def _polarity(recording: EventRecording, parallax: Parallax, no_frames: str) -> 
 
 
 def _depth_maps(recording: EventRecording, parallax: Parallax) -> Problem | OpenQuestion | None:
-    frames = recording.frames
+    frames = recording.depth_maps or recording.frames
     if frames is None or frames.depth_filenames is None:
         return None
     try:

@@ -249,6 +249,18 @@ class Camera:
             return cv2.fisheye.undistortImage(image, self.matrix, coefficients, Knew=matrix).reshape(image.shape)
         return cv2.undistort(image, self.matrix, coefficients, newCameraMatrix=matrix).reshape(image.shape)
 
+    def undistort_depth(self, depth: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+        """Returns the depth map of the camera `undistorted()`, at nearest pixels, since depths at edges do not mix."""
+        if self.model == "pinhole":
+            return depth
+        if self.model == "lookup":
+            column, row = cv2.split(self._seen_by)
+        else:
+            initialise = cv2.fisheye.initUndistortRectifyMap if self.model == "fisheye" else cv2.initUndistortRectifyMap
+            size, matrix = (self.width, self.height), self.undistorted().matrix
+            column, row = initialise(self.matrix, np.array(self.distortion), np.eye(3), matrix, size, cv2.CV_32FC1)
+        return cv2.remap(depth, column, row, cv2.INTER_NEAREST)
+
     def downscaled(self, factor: float) -> Camera:
         """Returns this pinhole camera with larger pixels.
 

@@ -18,7 +18,7 @@ from PIL.TiffImagePlugin import BITSPERSAMPLE, ImageFileDirectory_v2
 from rich.progress import track
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import is_deep, load_image
+from enerf_ns.dataparsers.recording.hdf5_files import is_deep_picture, load_picture
 
 DEPTHS = (8, 10, 12, 14, 16)
 """Numbers of bits that a camera may have."""
@@ -42,9 +42,9 @@ def find_white_level(files: tuple[Path, ...]) -> float:
         RecordingError: A file is missing or cannot be decoded, or some files hold integers and others floats.
     """
     largest, stated, kind = 0.0, 0.0, None
-    deep = [file for file in files if is_deep(file)]
+    deep = [file for file in files if is_deep_picture(file)]
     for file in track(deep, "Looking for the depth of pictures", transient=True, disable=len(deep) < 2):
-        image = load_image(file)
+        image = load_picture(file)
         if kind not in (None, image.dtype):
             raise RecordingError(
                 f"{file} holds values of type {image.dtype}, but pictures before it hold {kind}; give pictures of one "

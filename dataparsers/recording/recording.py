@@ -16,7 +16,7 @@ from PIL import Image
 
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import is_deep, load_depth, load_image
+from enerf_ns.dataparsers.recording.hdf5_files import is_deep_picture, load_depth_map, load_picture
 from enerf_ns.dataparsers.recording.picture_depth import find_white_level
 from enerf_ns.dataparsers.recording.pose_noise import pose_noise
 from enerf_ns.dataparsers.recording.time_units import Times, check_units, unusual_units
@@ -27,6 +27,8 @@ EVENTS_AT_A_TIME = 2**18
 
 LARGEST_GAMMA = 4.0
 """Largest exponent of gamma-encoded frames. Screens have 2.2."""
+KINDS_OF_FRAMES = {"frames": "frames", "blurred_frames": "blurred frames", "depth_maps": "depth maps"}
+"""Frames on the clock of a recording, by the name of its field, in words."""
 
 LONGEST_REFRACTORY_PERIOD = 10**12
 """Longest refractory period, nanoseconds."""
@@ -67,7 +69,7 @@ class Events:
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames, one file each, with their camera.
+    """Frames, one file each, or pictures within an HDF5 file (`hdf5_files`), with their camera.
 
     Raises:
         ValueError: The exposures are out of range. The message can follow "FILE holds".
@@ -80,8 +82,8 @@ class Frames:
     trajectory: Trajectory
     """Trajectory of the camera of the frames."""
     depth_filenames: tuple[Path, ...] | None = None
-    """Depth maps, .npy files, float32 [height, width]: depth along the optical axis in metres, 0 where nothing was
-    hit."""
+    """Depth maps of the camera, .npy files or within an HDF5 file, float32 [height, width]: depth along the optical
+    axis in metres, 0 where nothing was hit."""
     exposures: Int64[np.ndarray, " frames"] | None = None
     """Exposure of each frame, ns: 0, or from `SHORTEST_EXPOSURE` to the time between frames. None if it is not known. A
     frame is the mean brightness during its exposure."""
@@ -127,7 +129,7 @@ class Frames:
     @property
     def white_in_words(self) -> str:
         """Words that state the value of full brightness; empty for frames of 8 bits."""
-        return f", white is {self.white_level:g}" if is_deep(self.filenames[0]) else ""
+        return f", white is {self.white_level:g}" if is_deep_picture(self.filenames[0]) else ""
 
     def image(self, index: int) -> Shaped[np.ndarray, "height width channels"]:
         """Returns the linear brightness of a frame with one or three channels.
@@ -137,7 +139,7 @@ class Frames:
         Raises:
             RecordingError: The file is missing or cannot be decoded, or holds a value above the stated full brightness.
         """
-        image = load_image(self.filenames[index])
+        image = load_picture(self.filenames[index])
         if image.dtype == np.uint8 and self.gamma == 1.0:
             return image
         white = 255.0 if image.dtype == np.uint8 else self.white_level
@@ -174,7 +176,7 @@ class Frames:
         """
         if self.depth_filenames is None:
             return None
-        depth = load_depth(self.depth_filenames[index])
+        depth = self.camera.undistort_depth(load_depth_map(self.depth_filenames[index]))
         camera = self.picture_camera
         rows, columns = (
             ((np.arange(side) + 0.5) * self.downscale_factor).astype(int) for side in (camera.height, camera.width)
@@ -232,6 +234,8 @@ class EventRecording:
     """Name of the method that reconstructed the blurred frames from events; None if a camera took them."""
     held_out_frames: Frames | None = None
     """Views only for evaluation, with their own trajectory and clock."""
+    depth_maps: Frames | None = None
+    """Instants with depth maps but without pictures, whose `filenames` are those of the depth maps."""
     contrast_thresholds: tuple[float, float] | None = None
     """Contrast thresholds of on and of off events, within `CONTRAST_THRESHOLD_LIMITS`; None if they are not known."""
     refractory_period: int = 0
@@ -278,8 +282,7 @@ class EventRecording:
         self._set_files_of_recording()
         notes, shares = [*self.notes], dict(self.shares_outside_poses)
         covered = {
-            name: self._covered(getattr(self, name), what, notes, shares)
-            for name, what in (("frames", "frames"), ("blurred_frames", "blurred frames"))
+            name: self._covered(getattr(self, name), what, notes, shares) for name, what in KINDS_OF_FRAMES.items()
         }
         self._set(**covered, notes=tuple(notes), shares_outside_poses=shares)
 
@@ -547,17 +550,14 @@ def _with_smooth_poses(recording: EventRecording) -> EventRecording:
             smooth[id(own)] = own if found is None else found.smooth
         return replace(frames, trajectory=smooth[id(own)])
 
-    frames, blurred = of(recording.frames), of(recording.blurred_frames)
+    frames = {kind: of(getattr(recording, kind)) for kind in KINDS_OF_FRAMES}
     taken_off = noise.position, noise.rotation
-    return replace(
-        recording, trajectory=noise.smooth, frames=frames, blurred_frames=blurred, pose_noise_taken_off=taken_off
-    )
+    return replace(recording, trajectory=noise.smooth, pose_noise_taken_off=taken_off, **frames)
 
 
 @cache
 def _without_lenses(recording: EventRecording) -> EventRecording:
-    kinds = ("frames", "blurred_frames", "held_out_frames")
-    frames = {kind: getattr(recording, kind) for kind in kinds}
+    frames = {kind: getattr(recording, kind) for kind in (*KINDS_OF_FRAMES, "held_out_frames")}
     frames = {kind: value and replace(value, camera=value.camera.without_lens()) for kind, value in frames.items()}
     return replace(recording, camera=recording.camera.without_lens(), **frames)
 

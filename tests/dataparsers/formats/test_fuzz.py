@@ -31,8 +31,11 @@ import test_eds
 import test_esim_npz
 import test_event_recording
 import test_eventnerf
+import test_evimo2
 import test_llff_events
+import test_mvsec
 import test_tum_vie
+import test_vector
 import torch
 import yaml
 from hypothesis import HealthCheck, given, note, settings
@@ -46,7 +49,8 @@ from enerf_ns.dataparsers.formats.registry import _read_folder, formats, read_re
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import load_array, load_image
+from enerf_ns.dataparsers.recording.files import load_array
+from enerf_ns.dataparsers.recording.hdf5_files import load_picture
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -281,6 +285,57 @@ def plain_bag(folder: Path) -> Plain:
     return Plain(np.array(events, np.int64), np.array(times), matrices(rows[:, :3], rows[:, 3:]), none, none)
 
 
+def plain_evimo2(folder: Path) -> Plain:
+    """Of a camera that is not inverted."""
+    t, xy, p = (np.load(folder / f"dataset_events_{name}.npy") for name in ("t", "xy", "p"))
+    with np.load(folder / "dataset_info.npz", allow_pickle=True) as file:
+        meta = file["meta"].item()
+    rows = []
+    for instant in meta["full_trajectory"]:
+        if instant.get("cam") is not None:
+            place, turn = (instant["cam"]["pos"][name] for name in "tq")
+            rows.append([instant["cam"]["ts"], *(place[i] for i in "xyz"), *(turn[i] for i in "xyzw")])
+    poses, none = np.array(rows), np.zeros(0, np.int64)
+    events = np.column_stack([xy, np.rint(t.astype(np.float64) * 1e9).astype(np.int64), p]).astype(np.int64)
+    return Plain(events, np.rint(poses[:, 0] * 1e9).astype(np.int64), matrices(poses[:, 1:4], poses[:, 4:]), none, none)
+
+
+def plain_mvsec(folder: Path) -> Plain:
+    def nanoseconds(seconds: np.ndarray) -> np.ndarray:
+        return np.array([round(Fraction(time) * 10**9) for time in seconds.tolist()], np.int64)
+
+    name = next(folder.glob("*_data.hdf5")).name.removesuffix("_data.hdf5")
+    with h5py.File(folder / f"{name}_data.hdf5", "r") as file:
+        left: Any = file["davis/left"]
+        rows, stamps = left["events"][...], nanoseconds(left["image_raw_ts"][...]) if "image_raw" in left else []
+    with h5py.File(folder / f"{name}_gt.hdf5", "r") as file:
+        left = file["davis/left"]
+        times, poses = nanoseconds(left["pose_ts"][...]), left["pose"][...]
+        begins = nanoseconds(left["depth_image_raw_ts"][:1]) if "depth_image_raw" in left else np.zeros(0, np.int64)
+    events = np.column_stack([rows[:, [0, 1, 3]].astype(np.int64), nanoseconds(rows[:, 2])])[:, [0, 1, 3, 2]]
+    stamps = np.array(stamps, np.int64)
+    return Plain(events, times, poses, stamps, np.array([min([*stamps[:1], *begins])]), starts_at_zero=False)
+
+
+def plain_vector(folder: Path) -> Plain:
+    name = next(folder.glob("*.hdf5")).name.removesuffix(".synced.left_event.hdf5")
+    path = folder / f"{name}.synced.left_event.hdf5"
+    with h5py.File(path, "r") as file:
+        offset = int(np.asarray(file["t_offset"]).item()) * 1000 if "t_offset" in file else 0
+    body, joint = (
+        yaml.safe_load((folder / file).read_text(encoding="utf-8-sig"))
+        for file in ("camera_mocap_extrinsic_results1.yaml", "small_scale_joint_camera_extrinsic_results.yaml")
+    )
+    matrices = [np.array(body["cam0"]["T_cam_body"]).reshape(4, 4), np.array(joint["cam2"]["T_cam0_cam2"])]
+    mount = np.linalg.inv(matrices[0]) @ matrices[1].reshape(4, 4)
+    times, poses = poses_in(folder / f"{name}.synced.gt.txt", "s")
+    stamps = folder / f"{name}.synced.left_camera/timestamp.txt"
+    rows = rows_of(stamps) if stamps.exists() else []
+    opens, closes = (times_in([row[i:] for row in rows], "s") for i in (0, 1))
+    events = hdf5_events(path) + np.array([0, 0, offset, 0])
+    return Plain(events, times, poses @ mount, opens + (closes - opens) // 2, opens, starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -341,6 +396,9 @@ LAYOUTS = {
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
     "eventnerf": Layout("eventnerf", test_eventnerf.write_eventnerf, plain_eventnerf),
     "llff_events": Layout("llff_events", test_llff_events.write_llff_events, plain_llff_events),
+    "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2, ("dataset_depth.npz",)),
+    "mvsec": Layout("mvsec", test_mvsec.write_mvsec, plain_mvsec),
+    "vector": Layout("vector", test_vector.write_vector, plain_vector),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -351,12 +409,17 @@ Outcome = Literal["refused", "refused or the same", "the same", "refused or plai
 
 Draw = Callable[[st.SearchStrategy], Any]
 
-TABLES, TREES, ARRAYS, IMAGES = (".txt", ".conf"), (".json", ".yaml"), (".npy", ".npz", ".h5"), (".png", ".jpg")
+TABLES, TREES, ARRAYS, IMAGES = (
+    (".txt", ".conf"),
+    (".json", ".yaml"),
+    (".npy", ".npz", ".h5", ".hdf5"),
+    (".png", ".jpg"),
+)
 WITH_CHECKSUMS = (".npz", ".png")
 
 KINDS_OF_TABLES = {
-    "poses": ("*groundtruth*", "*poses*", "mocap_data.txt"),
-    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt"),
+    "poses": ("*groundtruth*", "*poses*", "mocap_data.txt", "*.gt.txt"),
+    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt", "timestamp.txt"),
     "events": ("events.txt",),
     "exposures": ("image_exposures*",),
     "others": ("*",),
@@ -371,16 +434,14 @@ OPTIONAL_KEYS = (
     *("camera", "frame_camera", "event_camera_from_frame_camera", "contrast_thresholds", "depth_range"),
     *("refractory_period_ns", "bayer_pattern"),
 )
-LISTS_OF_ANY_LENGTH = ("frames", "distortion")
+LISTS_OF_ANY_LENGTH = ("frames", "distortion", "data")
 
 WITH_FLOATS = ("eventnerf", "llff_events")
 """Formats whose columns of events may be floats."""
 OF_ANY_UNIT = "t of any unit"
-TIMES, COORDINATES, POLARITIES = (
-    ("t", "timestamp", "T_wc_timestamp", OF_ANY_UNIT),
-    ("x", "y", "position"),
-    ("p", "polarity"),
-)
+TIMES, SECONDS_OF_EVENTS = ("t", "timestamp", "T_wc_timestamp", OF_ANY_UNIT), ("dataset_events_t",)
+COORDINATES, POLARITIES = ("x", "y", "position", "dataset_events_xy"), ("p", "polarity", "dataset_events_p")
+NOT_READ = ("index", "discretization")
 ARRAYS_OF_ANY_LENGTH = ("rows", "poses_bounds", "distortion_params")
 
 OUTSIDE = (-1, 1280, 2**16 + 3, 2**31 + 3, 2**32 + 3, 2**40, -(2**32) + 3)
@@ -501,6 +562,13 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
     """A value of JSON or YAML."""
     load, dump = (yaml.safe_load, yaml.safe_dump) if path.suffix == ".yaml" else (json.loads, json.dumps)
     tree: Any = load(path.read_text(encoding="utf-8"))
+    outcome = damage_value(draw, tree)
+    path.write_text(dump(tree), encoding="utf-8")
+    return outcome
+
+
+def damage_value(draw: Draw, tree: Any) -> Outcome:
+    """One of nested values."""
     *above, key = draw(st.sampled_from(list(places_in(tree))))
     inside = tree
     for step in above:
@@ -526,7 +594,6 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
         inside[key] *= 2
         outcome = "refused or plain"
     note(repr(inside)[:200])
-    path.write_text(dump(tree), encoding="utf-8")
     return outcome
 
 
@@ -543,6 +610,7 @@ def kinds_of_damage(name: str, array: np.ndarray) -> list[str]:
     elif name in POLARITIES:
         kinds += ["p", "wider type"]
     elif array.dtype.kind == "f":
+        kinds += ["scaled", "unsorted"] * (name in SECONDS_OF_EVENTS)
         kinds += ["not finite"] + ["no rotation"] * (name == "T_wc_orientation")
         kinds += ["axes swapped"] * (name == "rectify_map")
     return kinds
@@ -605,14 +673,23 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         np.save(path, array)
         return "refused or plain" if path.parent.name == "depth" else outcome  # of which the shape is looked at
     if path.suffix == ".npz":
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=True) as file:
             arrays = dict(file)
         name, is_removed = draw(st.sampled_from(sorted(arrays))), draw(st.sampled_from([False] * 9 + [True]))
         called = OF_ANY_UNIT if (layout.format, name) == ("eventnerf", "t") else name
-        array, outcome = damage_array(draw, called, arrays.pop(name), layout.format in WITH_FLOATS)
+        if arrays[name].dtype.hasobject:
+            tree = arrays.pop(name).item()
+            damage_value(draw, tree)
+            array, outcome = np.array(tree, dtype=object), "refused or plain"
+        else:
+            array, outcome = damage_array(draw, called, arrays.pop(name), layout.format in WITH_FLOATS)
         np.savez(path, **arrays, **{} if is_removed else {name: array})
+        if name in NOT_READ or path.name == "dataset_depth.npz":
+            return "refused or the same"
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
+        if "davis/left" in file:
+            return damage_mvsec(draw, file["davis/left"])
         group: Any = file["events"] if "events" in file else file
         name = draw(st.sampled_from([name for name in ("x", "y", "t", "p", "rectify_map") if name in group]))
         kind = draw(st.sampled_from(["removed", *["exchanged"] * (name in "xy"), *["changed"] * 8]))
@@ -629,6 +706,20 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         called = OF_ANY_UNIT if is_llff and name == "t" else name
         group[name], outcome = damage_array(draw, called, array, is_llff)
         return outcome
+
+
+def damage_mvsec(draw: Draw, group: Any) -> Outcome:
+    """A dataset of one of the two files, of which "rows" are events x y t p."""
+    name = draw(st.sampled_from(sorted({"events", "image_raw", "image_raw_ts", "pose", "pose_ts"} & set(group))))
+    array = group[name][...]
+    del group[name]
+    if draw(st.sampled_from([False] * 9 + [True])):
+        return "refused or plain" if name == "image_raw" else "refused"
+    if name == "events":
+        array = array.astype(np.float64)
+    kind = {"events": "rows", "pose_ts": "seconds", "image_raw_ts": "seconds"}.get(name, name)
+    group[name], outcome = damage_array(draw, kind, array)
+    return "refused or plain" if name in ("image_raw_ts", "pose_ts", "pose", "image_raw", "events") else outcome
 
 
 def damage_image(draw: Draw, layout: Layout, path: Path) -> Outcome:
@@ -701,7 +792,7 @@ def facts(recording: EventRecording) -> dict[str, Any]:
         if frames is None:
             return None
         names = [str(file.relative_to(recording.path)) for file in frames.filenames]
-        pictures = [load_image(file) for file in frames.filenames]
+        pictures = [load_picture(file) for file in frames.filenames]
         depth = [load_array(file) for file in frames.depth_filenames or ()]
         return names, frames.times, frames.numbers, frames.camera, of_trajectory(frames.trajectory), pictures, depth
 

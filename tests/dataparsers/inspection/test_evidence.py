@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +158,18 @@ def test_a_fault_is_named(name: str, size: str, whole, tmp_path: Path):
     found = Evidence.of(read_recording(folder)).problems
     assert any(said in problem.what for problem in found), found
     assert all(problem.what.endswith(".") and problem.advice.endswith(".") for problem in found)
+
+
+def test_depth_maps_without_pictures_are_compared_with_the_events(whole, tmp_path: Path):
+    folder = tmp_path / "recording"
+    shutil.copytree(whole("small"), folder)
+    depth_maps(lambda depth: 1000 * depth)(folder)
+    recording = read_recording(folder)
+    frames = recording.frames
+    assert frames is not None and frames.depth_filenames is not None
+    maps = replace(frames, filenames=frames.depth_filenames)
+    found = Evidence.of(replace(recording, frames=None, depth_maps=maps)).problems
+    assert ["as if they were in millimetres" in problem.what for problem in found] == [True]
 
 
 @pytest.mark.sweep(2)
