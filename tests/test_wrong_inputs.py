@@ -106,7 +106,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "davis": ("events.txt", "groundtruth.txt", "calib.txt", "images/frame_00000001.png"),
     "esim_npz": ("camera_calibration.npz", "camera_poses.npz", "raw_events.npz"),
     "esim_bag": ("esim.bag",),
-    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5"),
     "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
