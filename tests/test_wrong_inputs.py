@@ -122,7 +122,7 @@ FILES: dict[str, tuple[str, ...]] = {
         "images_1/timestamps.npz",
         "images_1/01.png",
     ),
-    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
+    "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5"),
     "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),

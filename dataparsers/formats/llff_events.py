@@ -41,7 +41,7 @@ from typing import Optional
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64, UInt64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.columns import check_lengths, check_times
@@ -342,7 +342,7 @@ def _numbered(
     Returns:
         The pixels, the place (x, y) of pixel (0, 0), the distance between pixels, and width and height of the sensor.
     """
-    tree = cKDTree(places)
+    tree = KDTree(places)
     sample = places[:: max(len(places) // SAMPLED_PLACES, 1)]
     spacing = float(np.clip(np.median(tree.query(sample, k=2)[0][:, 1]), *SPACINGS)) if len(places) > 1 else 1.0
     low, high = places.min(axis=0), places.max(axis=0)

@@ -403,7 +403,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         notes=(
             "EventNeRF trains on all events and scores every tenth view of their path, without the first two, as here. "
             "The threshold of 0.25 is that of its configs.",
-            "E-3DGS fits an offset alone, as log-offset, and does not state its views.",
+            "E-3DGS fits an offset alone, as log-offset, and its code reads the validation views.",
         ),
     ),
     "ev-deblur-blender": Experiment(

@@ -147,6 +147,7 @@ def test_scene_with_whole_pixels(tmp_path: Path, factor: int):
     assert recording.frames is None and blurred is not None and held_out is not None
     assert [file.name for file in blurred.filenames] == ["00.png", "01.png", "03.png", "04.png"]
     np.testing.assert_array_equal(blurred.times, (STAMPS - ZERO)[EXPOSURES > 0] * 1000)
+    assert blurred.exposures is not None
     np.testing.assert_array_equal(blurred.exposures, EXPOSURES[EXPOSURES > 0] * 1000)
     assert [file.name for file in held_out.filenames] == ["02.png", "05.png"]
     np.testing.assert_allclose(held_out.trajectory.positions, poses()[SHARP_POSES, :3], rtol=0, atol=1e-12)

@@ -204,7 +204,7 @@ def test_converted_and_written_for_other_methods(tmp_path: Path, monkeypatch: py
     said = convert_recording(folder, tmp_path / "new")
     assert any(sentence.startswith("2 depth maps are left out") for sentence in said)
     frames, old = read_recording(tmp_path / "new").frames, read_recording(folder).frames
-    assert isinstance(frames, type(old)) and old is not None
+    assert frames is not None and old is not None
     for number, image in enumerate(scene.frames):
         np.testing.assert_array_equal(frames.image(number)[..., 0], image)
     for number, file in enumerate(write_pictures(old)):

@@ -163,6 +163,20 @@ def test_a_table_of_directions_is_as_good_as_the_distortion(camera: Camera):
     assert np.abs(found - expected)[2:-2, 2:-2].max() < 1.0
 
 
+@pytest.mark.parametrize("camera", [RADTAN, FISHEYE])
+def test_a_depth_map_without_distortion_holds_the_depth_of_each_direction(camera: Camera):
+    """Of a slanted plane, to less than it changes within a pixel; of a lens and of a table of its directions."""
+    normal = np.array([0.3, -0.2, 1.0])
+    depth = (2.0 / (camera.pixel_directions() @ normal)).astype(np.float32)
+    expected = 2.0 / (camera.undistorted().pixel_directions() @ normal)
+    for one in (camera, lookup_of(camera)):
+        found = one.undistort_depth(depth)
+        inside = found[2:-2, 2:-2]
+        assert np.abs(inside / expected[2:-2, 2:-2] - 1).max() < 0.005
+    pinhole = camera.undistorted()
+    assert pinhole.undistort_depth(depth) is depth
+
+
 def test_a_rotation_neither_stretches_nor_mirrors():
     turned = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     check_rotation(turned)
