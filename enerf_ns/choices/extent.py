@@ -7,7 +7,7 @@ import math
 from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import DATAPARSER, Scene
 from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not_explained
-from enerf_ns.dataparsers.scene.depth_range import share_beyond
+from enerf_ns.dataparsers.scene.depth_range import recording_parallax, share_beyond
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 SHARE_BEYOND = 0.05
@@ -47,9 +47,22 @@ def box(scene: Scene) -> None:
     scene.use("model.near_plane", lambda: near * scene.once(scale))
 
 
+def panorama(scene: Scene) -> None:
+    """Does the camera only turn, so that nothing shows how far surfaces are?"""
+    name, given = "model.panorama", scene.given(f"{DATAPARSER}.depth_range")
+    parallax = recording_parallax(scene.once(corrected_recording))
+    kept = scene.use(name, lambda: parallax.is_ruled_out and given is None)
+    why = f"the camera only turns: {parallax.why_ruled_out}" if parallax.is_ruled_out else "the camera moves"
+    why = scene.why(name, "a depth range is set by flag" if given is not None else why)
+    value = "a scene at infinity: it has no depth and no mesh, and looks the same from every place" * kept
+    scene.row("panorama", kept, value, why, name)
+
+
 def depths(scene: Scene) -> tuple[float, float]:
     """Nearest and farthest depth of the scene, m."""
     stated = scene.value(f"{DATAPARSER}.depth_range")
+    if scene.given("model.panorama") and stated is None and scene.recording.depth_range is None:
+        return recording_parallax(scene.once(corrected_recording)).panorama_range
     return depth_range_or_cause(scene.once(corrected_recording), stated, scene.recording)
 
 
@@ -67,6 +80,9 @@ def scale(scene: Scene) -> float:
 def contraction(scene: Scene) -> None:
     """Does the scene go on beyond the box?"""
     name, near_far = "model.contraction", scene.once(depths)
+    if scene.value("model.panorama"):
+        scene.use(name, lambda: False)
+        return
     is_set = scene.value(f"{DATAPARSER}.box") is not None
     share = 0.0 if is_set else share_beyond(scene.recording, near_far)
     kept = scene.use(name, lambda: share > SHARE_BEYOND)
@@ -77,7 +93,8 @@ def contraction(scene: Scene) -> None:
 def hash_grid(scene: Scene) -> None:
     """How fine is the hash grid?"""
     (near, far), coarsest = scene.once(depths), scene.config.model.base_res
-    footprint = math.sqrt(near * far) / scene.recording.camera.fx * scene.once(scale)
+    distance = 2.0 if scene.value("model.panorama") else math.sqrt(near * far) * scene.once(scale)
+    footprint = distance / scene.recording.camera.fx
     finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
     resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))
     name = "model.num_levels"
