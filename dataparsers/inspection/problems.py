@@ -335,8 +335,9 @@ def _distance_problems(
     if parallax.is_ruled_out:
         yield Problem(
             f"The camera only turns: {parallax.why_ruled_out}.",
-            "Nothing shows how far surfaces are, so that training learns a panorama, which has no depth, no mesh and no "
-            "view from another place. For these, move the camera sideways, and check that its positions are in metres.",
+            "Nothing shows how far surfaces are, so that training learns a panorama, which has no depth, no mesh and "
+            "no view from another place. For these, move the camera sideways, and check that its positions are in "
+            "metres.",
         )
     elif shift < MIN_PARALLAX:
         yield Problem(

@@ -129,9 +129,9 @@ class Parallax:
         if not self.extent:
             return "all its positions are the same"
         return (
-            f"its path spans {self.extent:.2g} m, over which its rotation alone explains {self.at_infinity[0]:,} parts of "
-            f"the views, depths explain {len(self.depths):,}, and depths behind the camera, which are chance, explain "
-            f"{self.num_by_chance:,}"
+            f"its path spans {self.extent:.2g} m, over which its rotation alone explains {self.at_infinity[0]:,} parts "
+            f"of the views, depths explain {len(self.depths):,}, and depths behind the camera, which are chance, "
+            f"explain {self.num_by_chance:,}"
         )
 
     @property
@@ -175,7 +175,8 @@ def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
         return parallax.panorama_range
     if not parallax.is_shown:
         raise UnknownDepthError(
-            recording, f"its path spans {parallax.extent:.3g} m, and its events show neither parallax nor that it only turns"
+            recording,
+            f"its path spans {parallax.extent:.3g} m, and its events show neither parallax nor that it only turns",
         )
     return parallax.depth_range
 

@@ -36,6 +36,9 @@ def box(scene: Scene) -> None:
     name, half_cube = f"{DATAPARSER}.depth_range", scene.use(f"{DATAPARSER}.box", lambda: None)
     scene.use(name, lambda: scene.once(depths))
     near, far = scene.once(depths)
+    scene.use("model.near_plane", lambda: near * scene.once(scale))
+    if scene.value("model.panorama") and half_cube is None:
+        return  # the box holds nothing
     if half_cube is None:
         value = f"depths {near:.2f} m to {far:.2f} m"
         why = "the recording states them" if scene.recording.depth_range else "measured from the events"
@@ -44,7 +47,6 @@ def box(scene: Scene) -> None:
         name = f"{DATAPARSER}.box"
         value, why = f"cube of {2 * half_cube[3]:g} m", scene.why(name, "")
     scene.row("box", True, value, why, name)
-    scene.use("model.near_plane", lambda: near * scene.once(scale))
 
 
 def panorama(scene: Scene) -> None:

@@ -88,7 +88,7 @@ def _pixels(scene: Scene, found: PoseNoise) -> float:
 
 
 def _distance(scene: Scene) -> float:
-    """Rough distance (m) of the scene before it is measured: as far as the camera goes, or far away if it only turns."""
+    """Rough distance (m) of the scene before it is measured: as far as the camera goes; if it only turns, far away."""
     recording = scene.recording
     depths = scene.parser.depth_range or recording.depth_range
     if depths is None:

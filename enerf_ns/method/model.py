@@ -490,7 +490,7 @@ class EnerfModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """psnr and ssim of one picture, and pictures of it.
+        """psnr and ssim of one picture, and pictures of it: frame and render, and depth, which a panorama has not.
 
         The brightness of this picture alone is aligned; `ns-eval` aligns all held-out frames together. There are no
         scores for a picture of events, nor for a picture that cannot be aligned.
@@ -503,11 +503,10 @@ class EnerfModel(Model):
                 rendered = aligned.rendered[0].clamp(0.0, 1.0)
                 found = {"psnr": psnr(rendered, recorded), "ssim": ssim(rendered, recorded)}
                 scores = {name: score for name, score in found.items() if not isinstance(score, str)}
-        depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
-        images = {
-            "img": torch.cat([recorded, rendered.nan_to_num()], dim=1),
-            "depth": depth / depth.max().clamp(min=1e-12),
-        }
+        images = {"img": torch.cat([recorded, rendered.nan_to_num()], dim=1)}
+        if not self.config.panorama:
+            depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
+            images["depth"] = depth / depth.max().clamp(min=1e-12)
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
