@@ -51,11 +51,12 @@ def box(scene: Scene) -> None:
 
 def panorama(scene: Scene) -> None:
     """Does the camera only turn, so that nothing shows how far surfaces are?"""
-    name, given = "model.panorama", scene.given(f"{DATAPARSER}.depth_range")
+    name, depths_name = "model.panorama", f"{DATAPARSER}.depth_range"
+    is_stated = scene.given(depths_name) is not None or depths_name in scene.preset_values
     parallax = recording_parallax(scene.once(corrected_recording))
-    kept = scene.use(name, lambda: parallax.is_ruled_out and given is None)
+    kept = scene.use(name, lambda: parallax.is_ruled_out and not is_stated)
     why = f"the camera only turns: {parallax.why_ruled_out}" if parallax.is_ruled_out else "the camera moves"
-    why = scene.why(name, "a depth range is set by flag" if given is not None else why)
+    why = scene.why(name, "a depth range is stated" if is_stated else why)
     value = "a scene at infinity: it has no depth and no mesh, and looks the same from every place" * kept
     scene.row("panorama", kept, value, why, name)
 

@@ -212,7 +212,7 @@ class EnerfModel(Model):
         super().populate_modules()
         config = self.config
         assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
-        assert config.contraction is not None and config.panorama is not None
+        assert config.contraction is not None
         assert (
             config.sampling
             and config.brightness

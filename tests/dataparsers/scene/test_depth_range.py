@@ -103,9 +103,7 @@ def test_events_show_that_a_camera_only_turns(noise: float, kind: str):
 
 @pytest.mark.parametrize("moved", [0.003, 0.005, 0.01, 0.02, 0.1])
 @pytest.mark.parametrize("milliseconds", [150, 400, 2000])
-def test_a_camera_only_turns_if_its_motion_moves_no_point_by_two_pixels_against_others(
-    moved: float, milliseconds: int
-):
+def test_a_camera_only_turns_if_its_motion_moves_no_point_by_two_pixels_against_others(moved: float, milliseconds: int):
     """Points at 1 to 3 m. Its rotation moves all of them by 20 pixels and more."""
     positions = shaking(moved)[:milliseconds]
     events, trajectory, _ = recording_of_points(points_between(1, 3), positions, TURNING[:milliseconds])
