@@ -83,7 +83,7 @@ class Export:
                 if value is not None:
                     raise FlagError(f"{flag} is for meshes and points; leave it out.")
         if self.what == "run":
-            config_file = pack_run(files, output)
+            config_file = pack_run(files.config, files.folder, output)
             print(printable(f"the run and its recording, {output.stat().st_size / 1e6:.1f} MB: {output}"))
             print(f"view it, where it was unpacked: ns-viewer --load-config {quoted(config_file)}")
             return
