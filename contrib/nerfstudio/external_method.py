@@ -16,7 +16,7 @@ To enable E-NeRF, you must install it first by running:
             ("enerf-paper-loss", "enerf with the loss of E-NeRF"),
             ("enerf-eventnerf", "enerf with the loss of EventNeRF"),
             ("enerf-robust", "enerf with the loss of Robust e-NeRF"),
-            ("enerf-deblur", "enerf with the loss of Ev-DeblurNeRF"),
+            ("enerf-deblur", "enerf with the loss of Deblur e-NeRF"),
         ],
         pip_package="enerf-ns",
     )
