@@ -68,7 +68,7 @@ class EnerfMethod:
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
-        """What nerfbaselines asks of a method before it is made."""
+        """Requirements and outputs of the method, before it is made."""
         return {
             "method_id": "",
             "required_features": frozenset(),
@@ -78,7 +78,7 @@ class EnerfMethod:
         }
 
     def get_info(self) -> dict[str, Any]:
-        """What nerfbaselines asks of a method that was made."""
+        """Requirements and outputs, and the settings and the step of this run."""
         config = self._config
         return {
             **self.get_method_info(),
