@@ -32,7 +32,7 @@ def row(name: str, parallax: Parallax, share: float | None) -> None:
     if parallax.is_shown:
         near, far = parallax.depth_range
         found = f"{near:.3g} to {far:.3g} m"
-    tiles = f"{len(parallax.depths)} / {parallax.num_by_chance} / {parallax.num_at_infinity}"
+    tiles = f"{len(parallax.depths)} / {parallax.num_by_chance} / {parallax.at_infinity[0]}"
     print(f"| {name} | {found} | {tiles} | {'-' if share is None else f'{share:.3f}'} |", flush=True)
 
 

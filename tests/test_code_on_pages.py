@@ -147,14 +147,14 @@ FLAG = re.compile(r"(?<![\w/-])--(?:pipeline|machine|viewer|optimizers|frame)\.[
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_every_flag_that_a_sentence_names_exists(page: Path):
-    known = flags_of_training() | flags_of("simulate")
+    known = flags_of_training("enerf") | flags_of_training("nerfacto") | flags_of("simulate")
     named = set(FLAG.findall(page.read_text()))
     assert sorted(named - known) == []
 
 
 @cache
-def flags_of_training() -> set[str]:
-    return help_of(lambda: parser_of("ns-train")(["enerf", "--help"]))
+def flags_of_training(method: str) -> set[str]:
+    return help_of(lambda: parser_of("ns-train")([method, "--help"]))
 
 
 @cache

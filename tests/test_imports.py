@@ -20,7 +20,8 @@ FILES = {
 }
 GROUND_FLOOR = "enerf_ns.dataparsers"
 ROOMS = [
-    *("scripts", "bench", "report", "export", "simulator", "reconstruction", "method", "choices", "evaluation"),
+    *("scripts", "nerfbaselines"),
+    *("bench", "report", "export", "simulator", "reconstruction", "method", "choices", "evaluation"),
     *("rendering", "supervision", "sensor", "poses", "events", "kernels", "terminal", "flags", "quiet"),
     *("dataparsers.event_dataparser", "dataparsers.inspection", "dataparsers.sensor_estimates", "dataparsers.scene"),
     *("dataparsers.index", "dataparsers.formats", "dataparsers.recording", "dataparsers.compiled"),

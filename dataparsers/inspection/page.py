@@ -47,7 +47,12 @@ from enerf_ns.dataparsers.recording.files import fill_page
 from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, percent
 from enerf_ns.dataparsers.recording.trajectory import evenly_spaced
-from enerf_ns.dataparsers.scene.depth_range import UnknownDepthError, scene_depth_range, share_beyond
+from enerf_ns.dataparsers.scene.depth_range import (
+    UnknownDepthError,
+    recording_parallax,
+    scene_depth_range,
+    share_beyond,
+)
 from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
@@ -118,7 +123,8 @@ class Inspection:
     recording: EventRecording
     statistics: EventStatistics
     depth_range: tuple[float, float] | None
-    """Nearest and farthest depth of the scene, metres. None if it is neither stated nor measurable."""
+    """Nearest and farthest depth of the scene, metres. None if it is neither stated nor measurable, or if the camera
+    only turns."""
     problems: list[Problem]
     sensor: SensorSurvey
     """Sensor parameters, stated and measured."""
@@ -143,6 +149,7 @@ class Inspection:
         except UnknownDepthError as error:
             unknown = [f"The depth range of the scene cannot be measured, because {error.reason}."]
         agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
+        shown = None if recording_parallax(recording).is_ruled_out else near_far
         contradictions = agreement.problems() if agreement else []
         evidence = Evidence.of(recording)
         problems = [*contradictions, *evidence.problems, *sensor.problems()]
@@ -150,11 +157,11 @@ class Inspection:
         mend = "State the range with --depth-range NEAR FAR of the data parser (metres), which training needs."
         if contradictions:
             mend = "Mend the first problem of this list. The wrong poses, clock or calibration can be the cause."
-        problems += [*find_problems(recording, near_far, statistics), *(Problem(what, mend) for what in unknown)]
+        problems += [*find_problems(recording, shown, statistics), *(Problem(what, mend) for what in unknown)]
         as_read = recording.as_read
         as_stated = None if as_read is None else Agreement.of(as_read, near_far)
         open_questions = tuple(one for one in [*questions, *evidence.unknown] if one is not None)
-        return cls(recording, statistics, near_far, problems, sensor, agreement, as_stated, open_questions)
+        return cls(recording, statistics, shown, problems, sensor, agreement, as_stated, open_questions)
 
     def print_tables(self, console: Console) -> None:
         """Prints all tables, notes in yellow and problems in red."""
@@ -239,6 +246,8 @@ class Inspection:
             rows["box"] = f"{sides} m, around all that the camera sees; 1 m is {scale:.3g} units in Nerfstudio"
         else:
             rows["near and far"] = rows["beyond"] = rows["box"] = "unknown"
+            if recording_parallax(recording).is_ruled_out:
+                rows["near and far"] = "unknown: the camera only turns, so that training learns a panorama"
         return rows
 
     def focus(self) -> dict[str, str]:

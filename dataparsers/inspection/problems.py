@@ -329,21 +329,20 @@ def _pose_problems(
 def _distance_problems(
     recording: EventRecording, statistics: EventStatistics, depth_range: tuple[float, float] | None
 ) -> Iterator[Problem]:
-    extent = _extent(recording, statistics)
+    extent, parallax = _extent(recording, statistics), recording_parallax(recording)
     nearest = depth_range[0] if depth_range else ASSUMED_NEAREST
     shift = recording.camera.fx * extent / nearest
-    found = None
-    if shift < MIN_PARALLAX:
-        found = f"its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by {shift:.1f} pixels"
-    elif (parallax := recording_parallax(recording)).is_ruled_out:
-        found = (
-            f"its rotation alone explains {parallax.num_at_infinity:,} parts of the views, depths explain "
-            f"{len(parallax.depths):,}, and depths behind the camera, which are chance, explain "
-            f"{parallax.num_by_chance:,}"
-        )
-    if found:
+    if parallax.is_ruled_out:
         yield Problem(
-            f"The camera only turns: {found}.",
+            f"The camera only turns: {parallax.why_ruled_out}.",
+            "Nothing shows how far surfaces are, so that training learns a panorama, which has no depth, no mesh and "
+            "no view from another place. For these, move the camera sideways, and check that its positions are in "
+            "metres.",
+        )
+    elif shift < MIN_PARALLAX:
+        yield Problem(
+            f"The camera hardly moves: its path spans {extent:.2g} m, which moves a point at {nearest:.2g} m by "
+            f"{shift:.1f} pixels.",
             "Without parallax, depth is unknown: move the camera sideways, and check that its positions are in metres.",
         )
     if extent > MAX_EXTENT:

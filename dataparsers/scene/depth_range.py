@@ -16,7 +16,7 @@ from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, quoted
-from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.recording import DEPTH_LIMITS, EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory, evenly_spaced
 
 GRID_WIDTH = 240
@@ -53,6 +53,14 @@ MIN_TILES = 20
 MIN_CHANCE_RATIO = 3.0
 """Smallest ratio of tiles with a depth to those by chance. If a camera only turns, it stays below 2."""
 
+MIN_SHARE_AT_INFINITY = 0.5
+"""Fewest tiles that rotation explains over the whole path, relative to the part of it that rotation explains best. If a
+camera only turns, it is at least 0.7; if the scene moves by 3 to 6 pixels beside the rotation, it is 0.2
+(`benchmarks/parallax.py`)."""
+
+PANORAMA_DISTANCE = 1000.0
+"""Distance of a scene before a camera that only turns, as a multiple of the extent of the camera's path."""
+
 MIN_SHARE_IN_RANGE = 0.2
 """Share of the measured depths within a depth range, below which the range is taken for a wrong one."""
 
@@ -86,8 +94,9 @@ class Parallax:
     num_by_chance: int
     """Number of tiles with a clear peak behind the camera, where nothing is seen. About as many of `depths` are
     wrong."""
-    num_at_infinity: int
-    """Number of tiles with a clear peak at infinity, which the camera's rotation alone explains."""
+    at_infinity: tuple[int, ...]
+    """Number of tiles with a clear peak at infinity, which the camera's rotation alone explains: over the whole path,
+    and over parts of it, each half as wide as the one before."""
     extent: float
     """Diagonal of the box around the camera's path, metres."""
 
@@ -98,15 +107,38 @@ class Parallax:
 
     @property
     def is_ruled_out(self) -> bool:
-        """Whether the camera only turns, or the whole scene is too far away for the camera's motion."""
-        moves = self.extent > 0 and self.num_at_infinity <= len(self.depths) + self.num_by_chance
-        return not self.is_shown and not moves
+        """Whether the camera only turns, or the whole scene is too far away for the camera's motion.
+
+        Its rotation explains the events then, over its whole path about as well as over a short part of it.
+        """
+        if self.is_shown or not self.extent:
+            return not self.is_shown
+        of_path = self.at_infinity[0]
+        others = len(self.depths) + self.num_by_chance
+        return of_path > max(MIN_TILES, others, MIN_SHARE_AT_INFINITY * max(self.at_infinity))
 
     @property
     def depth_range(self) -> tuple[float, float]:
         """0.7 times the 2nd and 1.4 times the 98th percentile of the depths, metres."""
         near, far = np.percentile(self.depths, [2, 98])
         return 0.7 * float(near), 1.4 * float(far)
+
+    @property
+    def why_ruled_out(self) -> str:
+        """The evidence for `is_ruled_out` as a clause."""
+        if not self.extent:
+            return "all its positions are the same"
+        return (
+            f"its path spans {self.extent:.2g} m, over which its rotation alone explains {self.at_infinity[0]:,} parts "
+            f"of the views, depths explain {len(self.depths):,}, and depths behind the camera, which are chance, "
+            f"explain {self.num_by_chance:,}"
+        )
+
+    @property
+    def panorama_range(self) -> tuple[float, float]:
+        """A range, metres, so far away that the camera's motion moves no point of it; for a camera that only turns."""
+        near = min(max(1.0, PANORAMA_DISTANCE * self.extent), DEPTH_LIMITS[1] / 2.0)
+        return near, 2.0 * near
 
     def contradicts(self, depth_range: tuple[float, float]) -> bool:
         """Whether hardly any of the depths lie within a range (nearest, farthest; metres)."""
@@ -117,6 +149,8 @@ class Parallax:
 
 def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | None = None) -> tuple[float, float]:
     """Nearest and farthest depth of a scene, metres.
+
+    If the camera only turns, the scene is taken to be far away, where the camera's motion moves no point of it.
 
     Args:
         recording: Its index is made if it is not there yet.
@@ -137,10 +171,13 @@ def scene_depth_range(recording: EventRecording, stated: tuple[float, float] | N
 
 def _measured_depth_range(recording: EventRecording) -> tuple[float, float]:
     parallax = recording_parallax(recording)
+    if parallax.is_ruled_out:
+        return parallax.panorama_range
     if not parallax.is_shown:
-        found = "the camera only turns: " if parallax.is_ruled_out else ""
-        reason = f"{found}its path spans {parallax.extent:.3g} m, and its events show no parallax"
-        raise UnknownDepthError(recording, reason)
+        raise UnknownDepthError(
+            recording,
+            f"its path spans {parallax.extent:.3g} m, and its events show neither parallax nor that it only turns",
+        )
     return parallax.depth_range
 
 
@@ -184,16 +221,18 @@ def measure_parallax(events: Events, camera: Camera, trajectory: Trajectory) -> 
         trajectory: Of that camera.
     """
     path = _path(events, trajectory)
-    extent, depths, num_by_chance, num_at_infinity = _extent(path[1]), [np.empty(0)], 0, 0
+    extent, depths, num_by_chance = _extent(path[1]), [np.empty(0)], 0
     is_file = not get_console().is_terminal  # in which a bar leaves an empty line
-    baselines = track(extent / 2.0 ** np.arange(6), "Measuring the depth of the scene", transient=True, disable=is_file)
+    of_parts = extent / 2.0 ** np.arange(6)
+    at_infinity = dict.fromkeys(of_parts.tolist(), 0)
+    baselines = track(of_parts, "Measuring the depth of the scene", transient=True, disable=is_file)
     planes = np.concatenate([DISPARITIES, -DISPARITIES])
     for baseline, sweep in _sweeps(events, camera, trajectory, path, baselines, planes):
         ahead, behind = np.split(sweep, 2, axis=1)
         depths.append(baseline * grid_focal_length(camera) / _clear_disparities(*ahead))
         num_by_chance += len(_clear_disparities(*behind))
-        num_at_infinity += _num_at_infinity(*sweep)
-    return Parallax(np.concatenate(depths), num_by_chance, num_at_infinity, extent)
+        at_infinity[float(baseline)] += _num_at_infinity(*sweep)
+    return Parallax(np.concatenate(depths), num_by_chance, tuple(at_infinity.values()), extent)
 
 
 def measure_share_beyond(

@@ -69,12 +69,14 @@ def evaluate(
 
 
 def _depth_rmse_all_poses(pipeline: EnerfPipeline, views: Sequence[HeldOutView]) -> dict[str, float]:
-    """Mean depth error in metres over all held-out and training poses."""
+    """Mean depth error in metres over all held-out and training poses; nothing for a panorama."""
     dataset = pipeline.datamanager.train_dataset
+    if pipeline.model.config.panorama:
+        return {}
     pairs = [(view.depth, view.recorded_depth) for view in views]
     if dataset.are_frames and dataset.frames.depth_filenames is not None:
         pairs += [(_depth(pipeline, dataset, index), dataset[index]["depth"]) for index in range(len(dataset))]
-    errors = [depth_rmse(depth, recorded) for depth, recorded in pairs if recorded is not None]
+    errors = [depth_rmse(depth, recorded) for depth, recorded in pairs if depth is not None and recorded is not None]
     known = [error for error in errors if not isinstance(error, str)]
     return {"depth_rmse_all_poses": float(np.mean(known))} if known else {}
 
@@ -92,7 +94,7 @@ def _near_depth(run: Run, views: Sequence[HeldOutView]) -> dict[str, float]:
     """Median depth error in metres of near surfaces in the unbounded scene."""
     errors = []
     for view in views:
-        assert view.recorded_depth is not None
+        assert view.depth is not None and view.recorded_depth is not None
         near = (view.recorded_depth > 0) & (view.recorded_depth < NEAR[1])
         errors.append((view.depth - view.recorded_depth)[near].abs())
     return {"near_depth_error": float(torch.cat(errors).median())}

@@ -7,7 +7,7 @@ import math
 from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import DATAPARSER, Scene
 from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not_explained
-from enerf_ns.dataparsers.scene.depth_range import share_beyond
+from enerf_ns.dataparsers.scene.depth_range import recording_parallax, share_beyond
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
 SHARE_BEYOND = 0.05
@@ -36,6 +36,9 @@ def box(scene: Scene) -> None:
     name, half_cube = f"{DATAPARSER}.depth_range", scene.use(f"{DATAPARSER}.box", lambda: None)
     scene.use(name, lambda: scene.once(depths))
     near, far = scene.once(depths)
+    scene.use("model.near_plane", lambda: near * scene.once(scale))
+    if scene.value("model.panorama") and half_cube is None:
+        return  # the box holds nothing
     if half_cube is None:
         value = f"depths {near:.2f} m to {far:.2f} m"
         why = "the recording states them" if scene.recording.depth_range else "measured from the events"
@@ -44,12 +47,25 @@ def box(scene: Scene) -> None:
         name = f"{DATAPARSER}.box"
         value, why = f"cube of {2 * half_cube[3]:g} m", scene.why(name, "")
     scene.row("box", True, value, why, name)
-    scene.use("model.near_plane", lambda: near * scene.once(scale))
+
+
+def panorama(scene: Scene) -> None:
+    """Does the camera only turn, so that nothing shows how far surfaces are?"""
+    name, depths_name = "model.panorama", f"{DATAPARSER}.depth_range"
+    is_stated = scene.given(depths_name) is not None or depths_name in scene.preset_values
+    parallax = recording_parallax(scene.once(corrected_recording))
+    kept = scene.use(name, lambda: parallax.is_ruled_out and not is_stated)
+    why = f"the camera only turns: {parallax.why_ruled_out}" if parallax.is_ruled_out else "the camera moves"
+    why = scene.why(name, "a depth range is stated" if is_stated else why)
+    value = "a scene at infinity: it has no depth and no mesh, and looks the same from every place" * kept
+    scene.row("panorama", kept, value, why, name)
 
 
 def depths(scene: Scene) -> tuple[float, float]:
     """Nearest and farthest depth of the scene, m."""
     stated = scene.value(f"{DATAPARSER}.depth_range")
+    if scene.given("model.panorama") and stated is None and scene.recording.depth_range is None:
+        return recording_parallax(scene.once(corrected_recording)).panorama_range
     return depth_range_or_cause(scene.once(corrected_recording), stated, scene.recording)
 
 
@@ -67,6 +83,9 @@ def scale(scene: Scene) -> float:
 def contraction(scene: Scene) -> None:
     """Does the scene go on beyond the box?"""
     name, near_far = "model.contraction", scene.once(depths)
+    if scene.value("model.panorama"):
+        scene.use(name, lambda: False)
+        return
     is_set = scene.value(f"{DATAPARSER}.box") is not None
     share = 0.0 if is_set else share_beyond(scene.recording, near_far)
     kept = scene.use(name, lambda: share > SHARE_BEYOND)
@@ -77,7 +96,8 @@ def contraction(scene: Scene) -> None:
 def hash_grid(scene: Scene) -> None:
     """How fine is the hash grid?"""
     (near, far), coarsest = scene.once(depths), scene.config.model.base_res
-    footprint = math.sqrt(near * far) / scene.recording.camera.fx * scene.once(scale)
+    distance = 2.0 if scene.value("model.panorama") else math.sqrt(near * far) * scene.once(scale)
+    footprint = distance / scene.recording.camera.fx
     finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
     resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))
     name = "model.num_levels"

@@ -12,6 +12,7 @@ from enerf_ns.dataparsers.inspection.agreement import Estimate, clock_of_frames
 from enerf_ns.dataparsers.inspection.agreement import clock_and_lens as sharpest_clock_and_lens
 from enerf_ns.dataparsers.recording.pose_noise import PoseNoise, pose_noise
 from enerf_ns.dataparsers.recording.recording import EventRecording, percent
+from enerf_ns.dataparsers.scene.depth_range import recording_parallax
 from enerf_ns.dataparsers.sensor_estimates.estimates import median_interval
 from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.refiner import turns_about_two_axes
@@ -87,10 +88,13 @@ def _pixels(scene: Scene, found: PoseNoise) -> float:
 
 
 def _distance(scene: Scene) -> float:
-    """Rough distance (m) of the scene before it is measured: as far as the camera goes."""
+    """Rough distance (m) of the scene before it is measured: as far as the camera goes; if it only turns, far away."""
     recording = scene.recording
-    near, far = scene.parser.depth_range or recording.depth_range or 2 * (path_extent(recording) or 1.0,)
-    return math.sqrt(near * far)
+    depths = scene.parser.depth_range or recording.depth_range
+    if depths is None:
+        parallax = recording_parallax(recording)
+        depths = parallax.panorama_range if parallax.is_ruled_out else 2 * (path_extent(recording) or 1.0,)
+    return math.sqrt(depths[0] * depths[1])
 
 
 @dataclass

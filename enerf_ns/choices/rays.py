@@ -28,6 +28,9 @@ which the part lowers the error of held-out pairs, and the standard error of tha
 def proposal_network(scene: Scene) -> None:
     """Where are rays sampled?"""
     model, (near, far), name = scene.config.model, scene.once(depths), "model.sampling"
+    if scene.value("model.panorama"):
+        scene.use(name, lambda: "uniform")
+        return
     nearness = 1 / near - (0.0 if scene.value("model.contraction") else 1 / far)
     disparity = scene.recording.camera.fx * path_extent(scene.recording) * nearness
     # also for a small disparity: even samples lost 2 to 5 dB at 11 pixels

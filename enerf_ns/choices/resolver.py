@@ -37,6 +37,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     frames.exposure_of_frames,
     brightness.colour,
     extent.undistortion,
+    extent.panorama,
     extent.box,
     extent.explainable,
     extent.contraction,

@@ -20,7 +20,13 @@ def in_words(scene: Scene) -> tuple[str, ...]:
     Args:
         scene: In which all rows have been decided.
     """
-    return tuple(sentence for sentence in (_limits(scene), _data(scene), _learned(scene)) if sentence)
+    panorama = ""
+    if scene.value("model.panorama"):
+        panorama = (
+            "The camera only turns, so that the field is a panorama: it has no depth and no mesh, and its pictures are "
+            "right only for views from where the camera was."
+        )
+    return tuple(sentence for sentence in (panorama, _limits(scene), _data(scene), _learned(scene)) if sentence)
 
 
 def flags_to_state(scene: Scene) -> tuple[str, ...]:
@@ -35,7 +41,8 @@ def flags_to_state(scene: Scene) -> tuple[str, ...]:
         "--pipeline.model.contrast-thresholds ON OFF": _assumes_threshold(scene),
         "--pipeline.datamanager.supervision events+frames": _holds_frames(scene) and not scene.use_frames,
         "--pipeline.model.mean-brightness MEAN": _assumes_level(scene),
-        "event-data --depth-range NEAR FAR": not (recording.depth_range or parser.depth_range or has_box),
+        "event-data --depth-range NEAR FAR": not (recording.depth_range or parser.depth_range or has_box)
+        and not scene.value("model.panorama"),
     }
     return tuple(flag for flag, is_open in flags.items() if is_open)[:MOST_FLAGS]
 

@@ -15,6 +15,7 @@ from enerf_ns.dataparsers.inspection.agreement import why_no_search
 from enerf_ns.dataparsers.inspection.evidence import Evidence
 from enerf_ns.dataparsers.inspection.problems import find_problems
 from enerf_ns.dataparsers.recording.errors import printable
+from enerf_ns.dataparsers.scene.depth_range import recording_parallax
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 from enerf_ns.poses.findings import Finding
 
@@ -46,7 +47,9 @@ def recording_table(parser: EventDataParserConfig) -> Table:
         rows[name] = (
             f"{len(frames.times)}, {frames.camera.width} x {frames.camera.height}{depth_note}{frames.white_in_words}"
         )
-    if depth is not None:
+    if depth is not None and depth == recording_parallax(recording).panorama_range:
+        rows["depths"] = "unknown: the camera only turns"
+    elif depth is not None:
         _, scale, box = scene_normalisation(recording, *depth, parser.box)
         rows["depths"] = f"{depth[0]:.2f} m to {depth[1]:.2f} m"
         rows["box"] = " x ".join(f"{side:.2f}" for side in (box[1] - box[0]) / scale) + " m"

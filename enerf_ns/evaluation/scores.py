@@ -46,9 +46,10 @@ def view_scores(
         for net in lpips_nets:
             scores[NETWORKS[net].score] = lpips(clipped, aligned.recorded, net)
     scores["correlation"] = correlation(view.rendered, view.recorded)
-    if view.recorded_depth is not None:
+    if view.recorded_depth is not None and view.depth is not None:
         scores["depth_rmse"] = depth_rmse(view.depth, view.recorded_depth)
-    if view.recorded_depth is not None and view.confidence is not None and view.spread_depth is not None:
+        if view.confidence is None or view.spread_depth is None:
+            return scores
         known, truth = view.confidence >= KNOWN, is_known(view.recorded_depth)
         found = depth_rmse(view.depth, view.recorded_depth.where(known, 0.0))
         scores["depth_rmse_known"] = (

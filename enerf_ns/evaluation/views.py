@@ -32,10 +32,10 @@ class HeldOutView:
     rendered: Tensor
     """Linear brightness that the field renders, three channels. If exposures of frames are learned, it has the exposure
     interpolated between the neighbouring training frames."""
-    depth: Tensor
-    """Rendered depth in metres along the optical axis, one channel."""
+    depth: Tensor | None
+    """Rendered depth in metres along the optical axis, one channel; None for a panorama, which has no depth."""
     recorded_depth: Tensor | None
-    """Depth in metres along the optical axis, 0 where unknown; None if the recording has no depth."""
+    """Depth in metres along the optical axis, 0 where unknown; None if the recording or the field has no depth."""
     time: int
     """Instant of the view, ns."""
     colour_filter: bool = False

@@ -68,9 +68,17 @@ def surface_views(pipeline: EnerfPipeline, number: int = NUM_VIEWS) -> tuple[Cam
 
     Returns:
         The event camera without distortion, and its views.
+
+    Raises:
+        RecordingError: The run is a panorama, which has no depth.
     """
     pipeline.eval()
     manager, model = pipeline.datamanager, pipeline.model
+    if model.config.panorama:
+        raise RecordingError(
+            f"The camera of {manager.recording.path} only turned, so that the run is a panorama without depth, and has "
+            "no surface; record sideways motion for one."
+        )
     recording, outputs = manager.recording, manager.train_dataparser_outputs
     camera, scale = recording.camera.undistorted(), outputs.dataparser_scale
     posed = PosedCamera(camera, recording.trajectory, outputs.metadata["transform"], scale, pipeline.device)

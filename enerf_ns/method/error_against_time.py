@@ -289,16 +289,18 @@ class ErrorAgainstTime:
             say(f"Step {done}: {self.verdict.sentence}")
 
     def _preview(self, done: int) -> None:
-        """Stores a picture of the first frame that moments score, its render, aligned alone, and its depth."""
+        """Stores a picture of the first frame that moments score, its render, aligned alone, and its depth, if any."""
         self.pipeline.eval()
         view = held_out_view(self.pipeline, self._numbers[0], self._preview_reduced_by)
         self.pipeline.train()
         recorded = view.rendered if view.recorded is None else view.recorded
         batch = {"image": recorded, "is_frame": view.recorded is not None}
-        _, images = self.pipeline.model.get_image_metrics_and_images({"rgb": view.rendered, "depth": view.depth}, batch)
-        depth = apply_depth_colormap(images["depth"], near_plane=0.0, far_plane=1.0)
-        shown = view.rendered if view.recorded is None else images["img"]
-        write_whole(self.folder / "previews" / f"step-{done:09d}.png", png(torch.cat([shown, depth], dim=1)))
+        outputs = {"rgb": view.rendered} if view.depth is None else {"rgb": view.rendered, "depth": view.depth}
+        _, images = self.pipeline.model.get_image_metrics_and_images(outputs, batch)
+        shown = [view.rendered if view.recorded is None else images["img"]]
+        if "depth" in images:
+            shown.append(apply_depth_colormap(images["depth"], near_plane=0.0, far_plane=1.0))
+        write_whole(self.folder / "previews" / f"step-{done:09d}.png", png(torch.cat(shown, dim=1)))
 
     def _status(self, done: int) -> str:
         """The line of progress. Its event correlation is a running mean over training pairs."""

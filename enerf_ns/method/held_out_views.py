@@ -64,13 +64,14 @@ def held_out_view(pipeline: RenderingPipeline, number: int, reduced_by: int = 1)
     if exposure is not None:
         gain, offset = exposure.at(time)
         rendered = (gain * rendered + offset).clamp(min=0.0)
-    depth = data.get("depth")
+    has_depth = not pipeline.model.config.panorama
+    depth = data.get("depth") if has_depth else None
     if depth is not None and reduced_by > 1:
         depth = _reduced(depth, reduced_by) * (_reduced(is_known(depth).float(), reduced_by) == 1.0)
     return HeldOutView(
         recorded=_reduced(data["image"][..., :3], reduced_by) if dataset.are_frames else None,
         rendered=rendered.cpu(),
-        depth=z_depth.cpu(),
+        depth=z_depth.cpu() if has_depth else None,
         recorded_depth=depth,
         time=time,
         colour_filter=pipeline.model.sensor.colour_filter is not None,
@@ -112,7 +113,7 @@ def held_out_views(
     if evidence:
         views = [_with_evidence(pipeline, *both, reduced_by) for both in zip(views, chosen, strict=True)]
     summary: dict[str, Score] = {
-        "num_rays_per_sec": sum(view.depth.numel() for view in views) / seconds,
+        "num_rays_per_sec": sum(view.rendered[..., 0].numel() for view in views) / seconds,
         "fps": len(views) / seconds,
     }
     if not dataset.are_frames:
@@ -172,7 +173,9 @@ def _rays(pipeline: RenderingPipeline, number: int, reduced_by: int = 1) -> RayB
 
 
 def _with_evidence(pipeline: RenderingPipeline, view: HeldOutView, number: int, reduced_by: int) -> HeldOutView:
-    """The view with its confidence in depth, and with depth spread from confident pixels."""
+    """The view with its confidence in depth, and with depth spread from confident pixels, if it has depth."""
+    if view.depth is None:
+        return view
     rays, scale = _rays(pipeline, number, reduced_by), pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     confidence, spread = depth_evidence(pipeline.model, rays, view.depth, view.rendered, scale)
     return replace(view, confidence=confidence, spread_depth=spread)

@@ -59,6 +59,16 @@ FAR_SHARE = 0.75
 FARTHEST = 1000.0
 """Far end of the rays where space is contracted, in scene units (halves of the longest side of the box)."""
 
+PANORAMA = (10.0, 10.02)
+"""Ends of the rays of a panorama, in scene units: outside the box, where the motion of a camera that only turns moves
+no point, and one after the other within about a cell of the finest level."""
+
+PANORAMA_SAMPLES = 2
+"""Samples along a ray of a panorama."""
+
+PANORAMA_DENSITY = 1e3
+"""Density of a panorama before training, in 1 / scene unit: it is opaque."""
+
 
 @dataclass
 class EnerfModelConfig(ModelConfig):
@@ -138,6 +148,9 @@ class EnerfModelConfig(ModelConfig):
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""
+    panorama: Optional[bool] = None  # noqa: UP045
+    """Learn a scene at infinity, whose brightness depends on the direction alone: a thin shell far outside the box.
+    Default: True where the camera only turns, unless a depth range is set."""
     contraction: Optional[bool] = None  # noqa: UP045
     """Contract the space beyond the box, out to infinity, as mip-NeRF 360 does. Without contraction the space beyond
     the box is empty. Default: True where a share of the events comes from beyond the box."""
@@ -216,7 +229,10 @@ class EnerfModel(Model):
             config.event_loss, config.event_loss_weight, config.no_event_loss_weight, config.no_event_margin
         )
         aabb = self.scene_box.aabb
-        if config.contraction:
+        contraction, init_density = self.is_unbounded, config.init_density
+        if config.panorama:
+            self.collider, init_density = NearFarCollider(*PANORAMA, reset_near_plane=False), PANORAMA_DENSITY
+        elif contraction:
             self.collider = NearFarCollider(config.near_plane, FARTHEST, reset_near_plane=False)
         else:
             self.collider = BoxCollider(self.scene_box, config.near_plane)
@@ -232,17 +248,17 @@ class EnerfModel(Model):
             max_res=config.max_res,
             log2_table_size=config.log2_table_size,
             hidden_dim=config.hidden_dim,
-            contraction=config.contraction,
-            init_density=config.init_density,
+            contraction=contraction,
+            init_density=init_density,
             backend=config.hash_grid,
         )
         # a field starts near a level of its own: without this gain, slider_depth was 1.3 dB worse at another level
         self.gain: float = config.mean_brightness / MEAN_BRIGHTNESS if config.level_loss_weight else 1.0
         # unbounded brightness leaks through any residual transmittance, so that no light may be dropped
         self._faint = 0.0 if config.brightness == "exponential" else FAINT
-        first_sampler = PairedPiecewiseSampler if config.contraction else PairedUniformSampler
+        first_sampler = PairedPiecewiseSampler if contraction else PairedUniformSampler
         self.proposal = self.expected = None
-        if config.sampling == "proposal":
+        if config.sampling == "proposal" and not config.panorama:
             # may run in half precision, since it only places samples: that moves changes of log brightness by a fifth
             # (bfloat16) or a thirtieth (float16) of what the jitter of the samples does
             self.proposal = HashDensity(
@@ -252,8 +268,8 @@ class EnerfModel(Model):
                 max_res=max(16, config.max_res // 2),
                 log2_table_size=15,
                 hidden_dim=16,
-                contraction=config.contraction,
-                init_density=config.init_density,
+                contraction=contraction,
+                init_density=init_density,
                 backend=config.hash_grid,
             )
             self.sampler = PairedProposalSampler(
@@ -261,9 +277,14 @@ class EnerfModel(Model):
             )
             self.expected = DensityVoxels(self.proposal)
         else:
-            self.sampler = first_sampler(num_samples=config.num_samples)
+            self.sampler = first_sampler(num_samples=PANORAMA_SAMPLES if config.panorama else config.num_samples)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
+
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether space beyond the box is rendered, too."""
+        return bool(self.config.contraction or self.config.panorama)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {"fields": [*self.field.parameters(), *(self.proposal.parameters() if self.proposal else ())]}
@@ -469,7 +490,7 @@ class EnerfModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """psnr and ssim of one picture, and pictures of it.
+        """psnr and ssim of one picture, and pictures of it: frame and render, and depth, which a panorama has not.
 
         The brightness of this picture alone is aligned; `ns-eval` aligns all held-out frames together. There are no
         scores for a picture of events, nor for a picture that cannot be aligned.
@@ -482,11 +503,10 @@ class EnerfModel(Model):
                 rendered = aligned.rendered[0].clamp(0.0, 1.0)
                 found = {"psnr": psnr(rendered, recorded), "ssim": ssim(rendered, recorded)}
                 scores = {name: score for name, score in found.items() if not isinstance(score, str)}
-        depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
-        images = {
-            "img": torch.cat([recorded, rendered.nan_to_num()], dim=1),
-            "depth": depth / depth.max().clamp(min=1e-12),
-        }
+        images = {"img": torch.cat([recorded, rendered.nan_to_num()], dim=1)}
+        if not self.config.panorama:
+            depth = outputs["depth"].nan_to_num(0.0, 0.0, 0.0)
+            images["depth"] = depth / depth.max().clamp(min=1e-12)
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:

@@ -281,7 +281,7 @@ class EnerfPipeline(VanillaPipeline):
         """Starts the field and the proposal network from the depth of edges that events show."""
         model = self.model
         places, edges = self.datamanager.edges()
-        if not len(edges):
+        if not len(edges) or model.config.panorama:
             say("Events show the depth of no edge, so that the field starts without.")
             return
         say(f"The field starts from {len(edges):,} points of edges.")

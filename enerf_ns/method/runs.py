@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -151,6 +152,7 @@ def load_any_method(
 
     from enerf_ns.terminal import without_chatter
 
+    allow_numpy_scalars_in_checkpoints()  # of runs on the data of another parser, too
     try:
         with without_chatter():
             return eval_setup(config_file, test_mode=test_mode)[:2]

@@ -42,15 +42,19 @@ GAP = 8
 class Screen(Display):
     """Display of brightness and depth."""
 
-    near: float
-    far: float
-    """Depths in metres at the ends of the colours."""
+    depth_range: tuple[float, float] | None
+    """Depths in metres at the ends of the colours; None for a panorama, whose depth is not shown."""
 
     @classmethod
-    def of(cls, views: Sequence[HeldOutView], depth_range: tuple[float, float]) -> Screen:
-        """A display that suits views, whose brightness is not aligned, and a depth range in metres."""
+    def of(cls, views: Sequence[HeldOutView], depth_range: tuple[float, float] | None) -> Screen:
+        """A display that suits views, whose brightness is not aligned, and a depth range in metres, if there is one."""
         shown = Display.of_views(views)
-        return cls(shown.correct, shown.exponent, *depth_range)
+        return cls(shown.correct, shown.exponent, depth_range)
+
+    @property
+    def scale_of_depth(self) -> dict[str, tuple[float, float]]:
+        """The depths at the ends of the colours by the title of the picture; empty if depth is not shown."""
+        return {} if self.depth_range is None else {"depth, metres": self.depth_range}
 
     def brightness(self, rendered: Float[Tensor, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """The field's linear brightness as displayed, 0 to 255."""
@@ -60,12 +64,14 @@ class Screen(Display):
         """Depth in metres in the colours of viridis."""
         from matplotlib import colormaps
 
-        share = (metres[..., 0].cpu().nan_to_num(self.far).numpy() - self.near) / max(self.far - self.near, 1e-9)
+        assert self.depth_range is not None
+        near, far = self.depth_range
+        share = (metres[..., 0].cpu().nan_to_num(far).numpy() - near) / max(far - near, 1e-9)
         return np.rint(255.0 * colormaps["viridis"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
 
 
 def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], output: Path) -> None:
-    """Renders a flight: brightness beside depth, with a scale of depth in metres.
+    """Renders a flight: brightness beside depth, with a scale of depth in metres, if depth is shown.
 
     Args:
         pipeline: Pipeline of a trained run.
@@ -78,7 +84,7 @@ def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], 
     """
     cameras = get_path_from_json(path)
     width = max(VIDEO_SIDE, int(path["render_width"]))
-    strip = _strip(width, {screen.gamma: None, "depth, metres": (screen.near, screen.far)})
+    strip = _strip(width, {screen.gamma: None, **screen.scale_of_depth})
 
     def pictures() -> Iterator[np.ndarray]:
         for number in track(range(len(cameras)), "Rendering the video", console=CONSOLE, transient=True):
@@ -94,7 +100,7 @@ def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], 
 
 
 def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None:
-    """Renders a small animated WebP: events, brightness and depth along the recorded path.
+    """Renders a small animated WebP: events, brightness and, if it is shown, depth along the recorded path.
 
     Args:
         pipeline: Pipeline of a trained run.
@@ -114,8 +120,7 @@ def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None
     posed = manager.event_camera_without_distortion
     strip = _strip(
         MOVING_SIDE,
-        {"events": ((ON_COLOUR, "brighter"), (OFF_COLOUR, "darker")), "render": None, "depth, metres":
-         (screen.near, screen.far)},
+        {"events": ((ON_COLOUR, "brighter"), (OFF_COLOUR, "darker")), "render": None, **screen.scale_of_depth},
     )  # fmt: skip
     pictures = []
     times = np.linspace(first, last, MOVING_FRAMES + 2).astype(np.int64)[1:-1]
@@ -153,12 +158,13 @@ def webp(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
 
 @torch.no_grad()
 def _sides(pipeline: EnerfPipeline, screen: Screen, rays: RayBundle) -> list[np.ndarray]:
-    """Pictures of brightness and depth along rays (height, width)."""
+    """Pictures of brightness, and of depth if it is shown, along rays (height, width)."""
     pipeline.eval()
     outputs = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
     scale = pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     metres = outputs["depth"] / rays.metadata["directions_norm"] / scale
-    return [screen.brightness(outputs["rgb"]), screen.depth(metres)]
+    shown = [screen.brightness(outputs["rgb"])]
+    return shown if screen.depth_range is None else [*shown, screen.depth(metres)]
 
 
 def _scaled(picture: UInt8[np.ndarray, "height width 3"], width: int) -> UInt8[np.ndarray, "tall wide 3"]:

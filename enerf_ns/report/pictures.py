@@ -89,7 +89,7 @@ def side_by_side(columns: Sequence[Column], views: Sequence[HeldOutView]) -> Fig
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    height, width = views[0].depth.shape[:2]
+    height, width = views[0].rendered.shape[:2]
     sides = [*[height / width] * len(views), 0.28]  # the last row explains the colours
     figure = Figure(figsize=(2.35 * len(columns), 0.3 + 2.35 * sum(sides)), layout="constrained", dpi=110)
     axes = figure.subplots(len(views) + 1, len(columns), squeeze=False, height_ratios=sides)
@@ -156,16 +156,17 @@ def columns_of(views: Sequence[HeldOutView], recording: EventRecording, exponent
         ]
         most = max(_quantile([error for error in errors if error is not None], 0.99, absolute=True), 0.01)
         columns.append(Column("error", errors, "render minus frame", "PuOr_r", (-most, most)))
-    depths = [view.depth[..., 0].numpy() for view in views]
+    depths = [view.depth[..., 0].numpy() for view in views if view.depth is not None]
     true = [_known_depth(view) for view in views]
-    of_scene = [depth for depth in true if depth is not None] or depths
+    of_scene = [depth for depth in true if depth is not None] or depths or [np.zeros(0)]
     limits = _quantile(of_scene, 0.01), _quantile(of_scene, 0.99, otherwise=1.0)
     sure = [view.confidence[..., 0].numpy() for view in views if view.confidence is not None]
     spread = [view.spread_depth[..., 0].numpy() for view in views if view.spread_depth is not None]
     faded = [(confidence / KNOWN).clip(FAINTEST, 1.0) for confidence in sure] or None
-    columns.append(
-        Column("rendered depth", depths, "metres (pale: uncertain)" if sure else "metres", "viridis", limits, faded)
-    )
+    if depths:
+        columns.append(
+            Column("rendered depth", depths, "metres (pale: uncertain)" if sure else "metres", "viridis", limits, faded)
+        )
     if spread:
         columns.append(Column("spread depth", spread, "metres", "viridis", limits, is_main=False))
     if any(depth is not None for depth in true):

@@ -16,7 +16,6 @@ from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
 from enerf_ns.dataparsers.recording.files import write_together, write_whole
-from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.scores import summary_scores
 from enerf_ns.evaluation.views import aligned_views
@@ -162,8 +161,13 @@ def _look_at(one: Reported, run: Run | None, output_dir: Path, scoring: Scoring,
         refiner, distance = run.pipeline.poses, run.pipeline.datamanager.distance
         if refiner is not None and refiner.looks:
             one.poses = [row.as_dict() for row in findings(refiner, distance)]
-        depth_range = scene_depth_range(dataset.recording, run.pipeline.datamanager.config.dataparser.depth_range)
-        screen = Screen.of(views, depth_range)
+        is_panorama = run.pipeline.model.config.panorama
+        screen = Screen.of(views, None if is_panorama else run.pipeline.datamanager.depth_range)
+        if is_panorama:
+            one.notes.append(
+                "The camera only turned, so that the run is a panorama: it has no depth, no mesh and no scores of "
+                "depth, and its pictures are right only for views from where the camera was."
+            )
         views, _ = aligned_views(views, scoring.protocol)
         one.columns = columns_of(views, dataset.recording, screen.exponent)
         one.caption = _caption(shown, len(dataset), stored, dataset.are_frames, screen)
@@ -179,10 +183,12 @@ def _look_at(one: Reported, run: Run | None, output_dir: Path, scoring: Scoring,
                 folder = output_dir / one.prefix
                 render_moving(run.pipeline, screen, folder / "moving.webp")
                 render_video(run.pipeline, screen, path, folder / "video.mp4")
-                one.video_note = f"Flight past the held-out cameras: {screen.gamma} on the left, depth on the right."
+                one.video_note = f"Flight past the held-out cameras: {screen.gamma}."
+                if not is_panorama:
+                    one.video_note = one.video_note[:-1] + " on the left, depth on the right."
                 one.moving, one.video = ((folder / name).read_bytes() for name in ("moving.webp", "video.mp4"))
                 one.poster = poster_of(folder / "video.mp4")
-                one.mesh = _turning_mesh(one, run.pipeline)
+                one.mesh = None if is_panorama else _turning_mesh(one, run.pipeline)
                 if one.mesh is not None:
                     write_whole(folder / "mesh.webp", one.mesh)
     else:

@@ -1,4 +1,5 @@
-"""`enerf export`: mesh, points, splats or refined poses of a run, in metres and in the axes of the recording."""
+"""`enerf export`: mesh, points, splats or refined poses of a run, in metres and in the axes of the recording; or the
+run and its recording in one file."""
 
 from __future__ import annotations
 
@@ -17,27 +18,37 @@ from enerf_ns.dataparsers.recording.files import absolute, expanded, write_toget
 if TYPE_CHECKING:
     from enerf_ns.method.pipeline import EnerfPipeline
 
-SUFFIXES = {"mesh": (".ply", ".glb"), "pointcloud": (".ply", ".glb"), "splats": (".ply",), "poses": (".txt",)}
+SUFFIXES = {
+    "mesh": (".ply", ".glb"),
+    "pointcloud": (".ply", ".glb"),
+    "splats": (".ply",),
+    "poses": (".txt",),
+    "run": (".zip",),
+}
 
 
 @dataclass
 class Export:
-    """Write a mesh, points, splats or the refined poses of a run, in metres and in the axes of the recording.
+    """Write a mesh, points, splats or the refined poses of a run, in metres and in the axes of the recording; or pack
+    the run.
 
     Regions that no camera saw, or whose depth the events do not determine, stay empty. If the recording was simulated,
     or a reference is given, the mesh or cloud is compared with it, and the scores are written into a .json file.
 
     Poses are those of the event camera after training, camera to world in OpenCV axes, on the clock of the events. The
     file has one line t px py pz qx qy qz qw for each pose (TUM format). A .json file beside it holds the lens.
+
+    A packed run is a ZIP file with the run and its recording, which another machine unpacks and views.
     """
 
-    what: Annotated[Literal["mesh", "pointcloud", "splats", "poses"], tyro.conf.Positional]
-    """Output: a mesh, a point cloud, Gaussian splats at the points (for viewers of 3D Gaussian splatting) or poses."""
+    what: Annotated[Literal["mesh", "pointcloud", "splats", "poses", "run"], tyro.conf.Positional]
+    """Output: a mesh, a point cloud, Gaussian splats at the points (for viewers of 3D Gaussian splatting), poses,
+    or the run itself."""
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run, or its config.yml."""
     output: Optional[Path] = None  # noqa: UP045
-    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .ply for splats, .txt for poses. Default:
-    mesh.ply, pointcloud.ply, splats.ply or poses.txt in the folder of the run."""
+    """File to write: .ply or .glb (glTF) for a mesh or a point cloud, .ply for splats, .txt for poses, .zip for the
+    run. Default: mesh.ply, pointcloud.ply, splats.ply, poses.txt or run.zip in the folder of the run."""
     voxel: Optional[float] = None  # noqa: UP045
     """Side in metres of the voxels in which depth is averaged. Default: 1.5 pixels at the median known depth."""
     reference: Optional[Path] = None  # noqa: UP045
@@ -47,6 +58,7 @@ class Export:
     def main(self) -> None:
         from trimesh import PointCloud
 
+        from enerf_ns.export.packing import pack_run
         from enerf_ns.export.scoring import simulated_scene, surface_scores
         from enerf_ns.export.splats import encode_splats, splat_sizes
         from enerf_ns.export.surface import VOXEL_PIXELS, fused, pixel_size, points_of, surface_views
@@ -66,10 +78,16 @@ class Export:
         check_outside_recordings("--output", output, files.config.data, self.reference)
         if not files.stored:
             raise RecordingError(f"{files.config_file.parent} has no whole checkpoint; wait for one, or train again.")
-        if self.what == "poses":
+        if self.what in ("poses", "run"):
             for flag, value in (("--voxel", self.voxel), ("--reference", self.reference)):
                 if value is not None:
                     raise FlagError(f"{flag} is for meshes and points; leave it out.")
+        if self.what == "run":
+            config_file = pack_run(files.config, files.folder, output)
+            print(printable(f"the run and its recording, {output.stat().st_size / 1e6:.1f} MB: {output}"))
+            print(f"view it, where it was unpacked: ns-viewer --load-config {quoted(config_file)}")
+            return
+        if self.what == "poses":
             self._write_poses(load(files.config_file).pipeline, files.config_file, output)
             return
         notes: list[str] = []

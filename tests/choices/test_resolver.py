@@ -425,6 +425,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "exposure of frames": (True, False),
         "colour": (3, 1),
         "undistortion": (True, False),
+        "panorama": (True, False),
         "contraction": (True, False),
         "proposal network": ("proposal", "uniform"),
         "opacity loss": (1.0, 0.0),

@@ -257,6 +257,7 @@ PICTURES: dict[str, dict[str, Any]] = {
     "default": {},
     "colour": {"num_channels": 3, "view_direction": True},
     "contraction": {"contraction": True},
+    "panorama": {"panorama": True},
     "uniform": {"sampling": "uniform", "num_samples": 21, "brightness": "sigmoid"},
     "bright": {"brightness": "exponential"},
 }
@@ -288,7 +289,7 @@ def test_a_picture_is_the_sum_over_all_samples(recording: Path, tmp_path: Path, 
     model.samples_at_once = 40 if "40" in backend else None
     with torch.no_grad():
         outputs = model(rays)
-    assert 0.01 < weights.sum(dim=1).mean() < 0.999
+    assert 0.01 < weights.sum(dim=1).mean() and (weights.sum(dim=1).mean() < 0.999 or setting == "panorama")
     expected = (weights * field[FieldHeadNames.RGB]).sum(dim=1).expand(-1, 3)
     torch.testing.assert_close(outputs["rgb"], expected, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(outputs["accumulation"], weights.sum(dim=1), rtol=0, atol=1e-3)

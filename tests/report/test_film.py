@@ -23,7 +23,7 @@ from enerf_ns.report import film
 from enerf_ns.report.film import Screen, render_moving, render_video
 from enerf_ns.report.pictures import camera_path
 
-PLAIN = Screen(lambda brightness: brightness, 1.0, 1.0, 3.0)
+PLAIN = Screen(lambda brightness: brightness, 1.0, (1.0, 3.0))
 
 
 def view(rendered: torch.Tensor, recorded: torch.Tensor | None) -> HeldOutView:
@@ -64,7 +64,7 @@ def test_depth_is_coloured_from_the_nearest_to_the_farthest():
 
 def test_gamma_is_told():
     assert PLAIN.gamma == "brightness"
-    assert Screen(PLAIN.correct, 1 / 2.2, 1.0, 3.0).gamma == "brightness^(1/2.2)"
+    assert Screen(PLAIN.correct, 1 / 2.2, (1.0, 3.0)).gamma == "brightness^(1/2.2)"
 
 
 def test_the_output_display_of_a_camera_is_what_the_report_shows(run: Run, capsys: pytest.CaptureFixture[str]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from small_runs import SMALL
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.export import surface
+from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import load, method_config, train
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.export import Export
@@ -144,3 +146,37 @@ def test_flags_of_meshes_are_none_of_poses(run: Path, tmp_path: Path):
         Export("poses", run, tmp_path / "poses.txt", voxel=0.1).main()
     with pytest.raises(FlagError, match=r"does not end with \.txt"):
         Export("poses", run, tmp_path / "poses.ply").main()
+
+
+def test_a_packed_run_is_rendered_elsewhere_though_the_original_is_gone(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    own, runs = tmp_path / "mine" / "recording", tmp_path / "mine" / "runs"
+    shutil.copytree(recording, own)
+    folder = train(method_config("enerf", own, runs, SMALL)).config_file.parent
+    here = load(folder / "config.yml").pipeline.model.state_dict()
+    Export("run", folder, tmp_path / "new" / "packed.zip").main()
+    shutil.rmtree(tmp_path / "mine")
+    with zipfile.ZipFile(tmp_path / "new" / "packed.zip") as packed:
+        assert packed.testzip() is None and not [name for name in packed.namelist() if name.startswith(("/", ".."))]
+        packed.extractall(tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    (config_file,) = Path("outputs").glob("*/enerf/*/config.yml")
+    assert str(tmp_path) not in config_file.read_text()
+    loaded = load(config_file)
+    assert loaded.pipeline.datamanager.recording.path.resolve() == (tmp_path / "elsewhere" / "recording").resolve()
+    for name, value in loaded.pipeline.model.state_dict().items():
+        torch.testing.assert_close(value, here[name], rtol=0, atol=0)
+    assert held_out_views(loaded.pipeline, evidence=False)[0][0].rendered.isfinite().all()
+
+
+def test_a_run_whose_recording_is_gone_is_not_packed(recording: Path, tmp_path: Path):
+    own = tmp_path / "recording"
+    shutil.copytree(recording, own)
+    folder = train(method_config("enerf", own, tmp_path / "runs", SMALL)).config_file.parent
+    shutil.rmtree(own)
+    with pytest.raises(RecordingError, match="of the run is not there any more"):
+        Export("run", folder, tmp_path / "packed.zip").main()
+    assert not (tmp_path / "packed.zip").exists()
+    with pytest.raises(FlagError, match="--voxel is for meshes"):
+        Export("run", folder, voxel=0.1).main()

@@ -372,7 +372,7 @@ class SceneView(ViewerControl):
             self._corrected.content = self._corrections_in_words
         if step > 0 and not self._showed_trained:
             self._showed_trained, self._shows_edges.value = True, False
-        if self._seen is None or model.config.contraction:
+        if self._seen is None or model.is_unbounded:
             return
         nears, fars = self._seen.span(rays.origins, rays.directions)
         if rays.nears is not None and rays.fars is not None:
@@ -390,8 +390,7 @@ class SceneView(ViewerControl):
         points = rays.origins + rays.directions * depth
         is_known = torch.ones_like(share, dtype=torch.bool)
         if self._seen is not None:
-            beyond = bool(self._model.config.contraction)  # whether space beyond the box is rendered, too
-            is_known = (share > 0.5) & self._seen.may_be_surface(points, beyond)[..., None]
+            is_known = (share > 0.5) & self._seen.may_be_surface(points, self._model.is_unbounded)[..., None]
             rgb = rgb / share.clamp(min=0.5)
         rgb = for_the_eye(rgb, self._level + self._stops.value, self._gamma.value)
         rgb = rgb.where(is_known, unknown(rgb.shape[:2], self.viewer.control_panel.background_color).to(rgb))
@@ -412,7 +411,9 @@ class SceneView(ViewerControl):
         metres = depth / self._scale
         known, (row, column) = metres[is_known], (side // 2 for side in metres.shape[:2])
         content = "Nothing was seen here."
-        if len(known):
+        if self._model.config.panorama:
+            content = "The camera only turned, so that no depth is known."
+        elif len(known):
             near, far = float(known.min()), float(known.max())
             metres = metres.clamp(near, far)
             middle = f"{float(metres[row, column]):.2f} m" if is_known[row, column] else "nothing"

@@ -14,7 +14,7 @@ from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, reco
 from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not_explained
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.poses.corrections import Corrections
 
 STATED = 0.8, 4.0
@@ -98,12 +98,20 @@ def test_a_depth_range_without_the_scene_is_named(shaken: EventRecording):
     assert found is not None and "depth range is 10 m to 40 m, but the parallax" in found
 
 
-def test_without_a_cause_the_depth_range_is_asked_for():
-    """Right poses of a camera that only turns."""
+def test_a_camera_that_only_turns_has_no_cause():
     turning = recording_of(np.zeros((2000, 3)))
-    with pytest.raises(RecordingError, match=r"no parallax; look at it with enerf inspect .* --depth-range NEAR FAR"):
-        depth_range_or_cause(turning)
-    assert why_not_explained(turning, STATED, turning) is None
+    for depth_range in (depth_range_or_cause(turning), STATED):
+        assert why_not_explained(turning, depth_range, turning) is None
+
+
+def test_without_a_cause_the_depth_range_is_asked_for():
+    """Events in random places show neither parallax nor that the camera only turns."""
+    events, trajectory, _ = recording_of_points(points_between(1.0, 3.0), shaking(0.1), TURNING)
+    generator = np.random.default_rng(0)
+    events = Events(generator.permutation(events.x), generator.permutation(events.y), events.t, events.p)
+    random = EventRecording(Path("a memory"), "test", CAMERA, trajectory, lambda: iter([events]), ())
+    with pytest.raises(RecordingError, match=r"neither .*; look at it with enerf inspect .* --depth-range NEAR FAR"):
+        depth_range_or_cause(random)
 
 
 def test_the_cause_is_searched_in_the_recording_as_read(shaken: EventRecording):

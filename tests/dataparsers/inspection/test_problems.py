@@ -134,7 +134,7 @@ PROBLEMS = {
     "switched markers": (
         dict(poses=changed_poses("switched markers")), r"1 jump; .* by 0.3 m and .* at 1.25 s", "0.001 1.245",
     ),
-    "turning": (dict(poses=changed_poses("turning")), r"only turns: its path spans 0.0005 m", "move the camera"),
+    "turning": (dict(poses=changed_poses("turning")), r"hardly moves: its path spans 0.0005 m", "move the camera"),
     "millimetres": (dict(poses=changed_poses("millimetres")), r"spans 500 m", "millimetres"),
     "deep scene": (dict(depth_range=(0.01, 50.0)), r"from 0.01 m to 50 m", "--depth-range NEAR FAR"),
     "silence": (dict(events=changed_events("silence")), r"silent once .* lasts 0.\d+ s from 0.5\d s", "range 0.7"),
