@@ -108,6 +108,7 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "tum_vie_prepared": ("calib_undist.json", "mocap-imu-calib.json"),
             "esim_npz": ("camera_calibration.npz",),
             "esim_bag": ("esim.bag", "esim.conf"),
+            "ros_bag_2": ("metadata.yaml", "bag.db3"),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),
         }.items()

@@ -104,6 +104,8 @@ FILES: dict[str, tuple[str, ...]] = {
     "davis": ("events.txt", "groundtruth.txt", "calib.txt", "images/frame_00000001.png"),
     "esim_npz": ("camera_calibration.npz", "camera_poses.npz", "raw_events.npz"),
     "esim_bag": ("esim.bag",),
+    "ros_bag_1": ("recording.bag",),
+    "ros_bag_2": ("bag.db3",),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }

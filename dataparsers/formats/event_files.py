@@ -269,11 +269,28 @@ def _evt21_order(path: Path, words: bytes) -> str:
 
 
 def _decode_evt3(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    decoder = _import("evt3", path).Decoder()
+    decode = evt3_decoder(path)
     for words in pieces:
+        yield decode(words)
+
+
+def evt3_decoder(path: Path) -> Callable[[np.ndarray], Events]:
+    """Returns a function that decodes one piece of EVT3 words (<u2) after the other; times in microseconds.
+
+    The time counter has 24 bits, which restart after 16.8 s. The function counts on. It holds events back until the
+    first word of time. It raises RecordingError at a word that EVT3 has not.
+
+    Raises:
+        RecordingError: The package evt3 is not installed.
+    """
+    decoder = _import("evt3", path).Decoder()
+
+    def decode(words: np.ndarray) -> Events:
         _check_types(path, words >> 12, EVT3_TYPES, "EVT3")
         events = decoder.feed(words.tobytes())
-        yield Events(events.x, events.y, events.t.astype(np.int64), events.p)
+        return Events(events.x, events.y, events.t.astype(np.int64), events.p)
+
+    return decode
 
 
 def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:

@@ -12,10 +12,11 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, tum_vie
+from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, ros_bag, tum_vie
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
+from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording
@@ -124,7 +125,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, event_recording):
     register(_module.FORMAT)
 
 
@@ -144,6 +145,8 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
                 "own poses; convert it without --poses, and give --poses with the new recording."
             )
         options["poses"] = poses
+    if "ENERF_CACHE" in os.environ:
+        check_outside_recordings("ENERF_CACHE", cache_folder())
     name_links_out(path)
     try:
         with of_file(path):
@@ -190,8 +193,11 @@ def _files_found(path: Path) -> dict[Format, int]:
 
 
 def _find_format(path: Path) -> Format:
-    """Returns the format with the most files in a folder."""
-    found = _files_found(path)
+    """Returns the format with the most files in a folder. Exact names count a little more than patterns."""
+    found = {
+        format: count + 0.1 * sum((path / name).exists() for name in format.files)
+        for format, count in _files_found(path).items()
+    }
     best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) == 1:
         return best[0]

@@ -139,6 +139,13 @@ def write_bag(folder: Path) -> None:
     test_esim_bag.write_recording(folder)
 
 
+def write_ros_bag(folder: Path, ros: int) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is an optional extra of the project")
+    import test_ros_bag  # here, since it skips where rosbags is not installed
+
+    test_ros_bag.write_bag(folder, test_ros_bag.Bag(ros, events=EVENTS))
+
+
 def write_own(folder: Path) -> None:
     camera = {**test_event_recording.CAMERA, "model": "radtan", "distortion": [-0.1, 0.02, 0.001, -0.002]}
     test_event_recording.write_recording(
@@ -279,6 +286,30 @@ def plain_bag(folder: Path) -> Plain:
     return Plain(np.array(events, np.int64), np.array(times), matrices(rows[:, :3], rows[:, 3:]), none, none)
 
 
+def plain_ros_bag(folder: Path, ros: int) -> Plain:
+    """By the types of the messages, each of which has one topic; on the clock of ROS."""
+    from rosbags.highlevel import AnyReader
+    from test_ros_bag import make_store
+
+    events, times, poses, stamps = [], [], [], []
+    path = folder if (folder / "metadata.yaml").exists() else next(folder.glob("*.bag" if ros == 1 else "*.db3"))
+    with AnyReader([path], default_typestore=make_store(ros)) as bag:
+        for connection, _, data in bag.messages():
+            message: Any = bag.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            if connection.msgtype.endswith("EventArray"):
+                events += [(e.x, e.y, e.ts.sec * 10**9 + e.ts.nanosec, e.polarity) for e in message.events]
+            elif connection.msgtype.endswith("PoseStamped"):
+                times.append(stamp)
+                p, q = message.pose.position, message.pose.orientation
+                poses.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            elif connection.msgtype.endswith("Image"):
+                stamps.append(stamp)
+    rows, frames = np.array(poses), np.array(stamps, np.int64)
+    found = matrices(rows[:, :3], rows[:, 3:])
+    return Plain(np.array(events, np.int64), np.array(times), found, frames, frames, starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -309,6 +340,12 @@ LAYOUTS = {
     "davis": Layout("davis", write_small_davis, plain_davis, ("images.txt",), lists_images=True),
     "esim_npz": Layout("esim_npz", write_small_npz, plain_npz, ("transforms_test.json",), lists_images=True),
     "esim_bag": Layout("esim_bag", write_bag, plain_bag, ("esim.conf",)),
+    **{
+        f"ros_bag_{ros}": Layout(
+            "ros_bag", partial(write_ros_bag, ros=ros), partial(plain_ros_bag, ros=ros), ("metadata.yaml",)
+        )
+        for ros in (1, 2)
+    },
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -658,7 +695,7 @@ def facts(recording: EventRecording) -> dict[str, Any]:
     def of_frames(frames: Frames | None) -> tuple | None:
         if frames is None:
             return None
-        names = [str(file.relative_to(recording.path)) for file in frames.filenames]
+        names = [file.name for file in frames.filenames]
         pictures = [load_image(file) for file in frames.filenames]
         depth = [load_array(file) for file in frames.depth_filenames or ()]
         return names, frames.times, frames.numbers, frames.camera, of_trajectory(frames.trajectory), pictures, depth
