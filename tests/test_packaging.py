@@ -124,6 +124,7 @@ def test_constraints_hold_on_the_first_release_of_each_python():
 def test_entry_points_are_specifications():
     assert {point.name for point in ENTRY_POINTS} >= {
         "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
+        "rosbag-events", "m3ed-events", "dsec-events", "e2nerf-events",
         "tumvie-events", "event-recording", *PUBLISHED_LOSSES,
     }  # fmt: skip
     for point in ENTRY_POINTS:

@@ -106,6 +106,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "esim_bag": ("esim.bag",),
     "ros_bag_1": ("recording.bag",),
     "ros_bag_2": ("bag.db3",),
+    "m3ed": ("seq_data.h5", "seq_pose_gt.h5"),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }

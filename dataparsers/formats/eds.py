@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -37,15 +37,13 @@ from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, Hdf5EventsFile,
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
 from enerf_ns.dataparsers.formats.text_tables import read_poses, read_times
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_poses
+from enerf_ns.dataparsers.formats.yaml_values import LARGEST_YAML, parse_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import LONGEST_LINE, check_image_sizes, in_colour, read_text
+from enerf_ns.dataparsers.recording.files import check_image_sizes, in_colour, read_text
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    import yaml
 
 FILES = ("events.h5", "stamped_groundtruth*.txt", "images_timestamps*.txt")
 
@@ -60,9 +58,6 @@ STAMPS = ("images_timestamps.txt", "images_timestamps_us.txt")
 
 CLOCK_START = 1000 * 10**9
 """Time (ns) in the files of a written recording at the simulation's time 0."""
-
-LARGEST_CAMCHAIN, MOST_VALUES = 2**18, 10_000
-"""Most bytes and most values of a camchain. Kalibr writes a few thousand bytes and a hundred values."""
 
 OFFSET_TOLERANCE = 2000
 """Largest rounding of a time by the preparation, nanoseconds."""
@@ -263,26 +258,8 @@ def _find_camchain(folder: Path) -> Path | None:
 
 def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4"]]:
     """Returns the RGB camera, the event camera, and the pose of the RGB camera in the axes of the event camera."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Reads 1e-05 as a number. YAML 1.1 takes it for text."""
-
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"])
-    text = read_text(path, "a Kalibr camchain", LARGEST_CAMCHAIN)
-    loader = Loader(text)
-    try:
-        node = loader.get_single_node()
-        if node is not None:
-            _num_values(node, {})
-        camchain = Value(path, None if node is None else loader.construct_document(node))
-    except Exception as error:  # PyYAML raises other ones for wrong values of each type
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}," if mark else ""
-        found = f" ({error})" if type(error) is ValueError else ""
-        raise RecordingError(
-            f"{path}{line} cannot be read as YAML{found}, but a Kalibr camchain was expected."
-        ) from error
+    text = read_text(path, "a Kalibr camchain", LARGEST_YAML)
+    camchain = parse_yaml(path, text, "a Kalibr camchain")
     rgb_camera, camera = (_kalibr_camera(camchain[name]) for name in ("cam0", "cam1"))
     event_from_rgb = camchain["cam1"]["T_cn_cnm1"].pose()
     if _event_camera(text, camchain) == "cam0":
@@ -293,29 +270,6 @@ def _read_camchain(path: Path) -> tuple[Camera, Camera, Float64[np.ndarray, "4 4
             f"{SENSOR_SIZE[0]} x {SENSOR_SIZE[1]}; give the calibration of this recording."
         )
     return rgb_camera, camera, event_from_rgb
-
-
-def _num_values(node: yaml.Node, known: dict[int, int]) -> int:
-    """Returns the number of values below a node of YAML, with those that aliases repeat.
-
-    Args:
-        node: The node.
-        known: The numbers of nodes that were counted before, by their id.
-
-    Raises:
-        ValueError: There are more than `MOST_VALUES`, a value holds itself, or a value is too long.
-    """
-    if len(node.value) > (LONGEST_LINE if isinstance(node.value, str) else MOST_VALUES):
-        raise ValueError(f"a value of {len(node.value):,} letters or parts")
-    if isinstance(node.value, str):
-        return 1
-    if id(node) not in known:
-        known[id(node)] = MOST_VALUES + 1  # while its own values are counted, among which it must not be
-        items = [item if isinstance(item, tuple) else (item,) for item in node.value]  # those of a mapping are pairs
-        known[id(node)] = 1 + sum(_num_values(part, known) for item in items for part in item)
-    if known[id(node)] > MOST_VALUES:
-        raise ValueError(f"aliases that repeat values more than {MOST_VALUES:,} times")
-    return known[id(node)]
 
 
 def _event_camera(text: str, camchain: Value) -> str:

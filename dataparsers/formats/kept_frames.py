@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -22,7 +22,7 @@ STAMPS = "stamps_ns.npy"
 
 
 def keep_frames(
-    source: Path, name: str, frames: Iterable[tuple[int, Shaped[np.ndarray, "height width channels"]]]
+    source: Path, name: str, frames: Callable[[], Iterator[tuple[int, Shaped[np.ndarray, "height width channels"]]]]
 ) -> tuple[tuple[Path, ...], Int64[np.ndarray, " frames"]]:
     """Returns the files (PNG) and stamps of frames, which are written to the cache unless they are there.
 
@@ -31,7 +31,8 @@ def keep_frames(
     Args:
         source: The file that holds them.
         name: What distinguishes them from other frames of the file, such as a topic.
-        frames: Stamp (ns), and pixels in RGB or grey, uint8 or uint16. They are only read if they are not kept yet.
+        frames: Function that yields stamps (ns), and pixels in grey or RGB, uint8 or uint16. It is only called if the
+            frames are not kept yet.
 
     Raises:
         RecordingError: The stamps do not increase.
@@ -42,7 +43,7 @@ def keep_frames(
     try:
         folder = cache_folder() / f"frames-{hashlib.sha256(made_from.encode()).hexdigest()[:32]}"
         if not (folder / STAMPS).exists():
-            _write(folder, source, name, frames)
+            _write(folder, source, name, frames())
     except OSError as error:
         raise OutputError(
             f"The frames of {source} cannot be written to the cache ({error.strerror or error}); make room, or set "
@@ -52,7 +53,7 @@ def keep_frames(
     return tuple(folder / _file_name(i) for i in range(len(stamps))), stamps
 
 
-def _write(folder: Path, source: Path, name: str, frames: Iterable[tuple[int, np.ndarray]]) -> None:
+def _write(folder: Path, source: Path, name: str, frames: Iterator[tuple[int, np.ndarray]]) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_of(folder)
     partial.mkdir()

@@ -12,8 +12,9 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, ros_bag, tum_vie
+from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, m3ed, ros_bag, tum_vie
 from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.cache import cache_folder
@@ -125,7 +126,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, m3ed, event_recording):
     register(_module.FORMAT)
 
 
@@ -163,7 +164,7 @@ def _check_options(path: Path, found: Format, options: dict[str, object]) -> Non
         having = [format.name for format in formats() if option in (field.name for field in fields(format.options))]
         if found.name not in having:
             flag = f"--{option.replace('_', '-')}"
-            whose = f"is for recordings of {' and '.join(having)}" if having else "is no option of any format"
+            whose = f"is for recordings of {in_words(having)}" if having else "is no option of any format"
             raise FlagError(f"{flag} {whose}, but {path} is read as {found.name}; leave it out.")
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
@@ -316,7 +317,7 @@ def _read_frames(
             f"camera of {camera.width} x {camera.height} pixels; state their camera as frame_camera in camera.json."
         )
         return none
-    return keep_frames(_files_of(path)[0], topic, _images(path, topic, (width, height)))
+    return keep_frames(_files_of(path)[0], topic, partial(_images, path, topic, (width, height)))
 
 
 def _images(path: Path, topic: str, size: tuple[int, int] | None = None) -> Iterator[tuple[int, np.ndarray]]:

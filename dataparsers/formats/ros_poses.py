@@ -39,7 +39,7 @@ class PoseFlagNames:
     topic: str = "--poses-topic"
     frames: str = "--poses-frames"
     otherwise: str = ""
-    """What else can be done where a bag has no poses, such as ", or do so"."""
+    """Words for another way to poses where a bag has none, such as ", or do so"."""
 
 
 def read_bag(

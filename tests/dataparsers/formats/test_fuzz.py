@@ -30,6 +30,7 @@ import pytest
 import test_eds
 import test_esim_npz
 import test_event_recording
+import test_m3ed
 import test_tum_vie
 import torch
 import yaml
@@ -144,6 +145,10 @@ def write_ros_bag(folder: Path, ros: int) -> None:
     import test_ros_bag  # here, since it skips where rosbags is not installed
 
     test_ros_bag.write_bag(folder, test_ros_bag.Bag(ros, events=EVENTS))
+
+
+def write_m3ed(folder: Path) -> None:
+    test_m3ed.write_m3ed(folder, events=EVENTS)
 
 
 def write_own(folder: Path) -> None:
@@ -310,6 +315,15 @@ def plain_ros_bag(folder: Path, ros: int) -> Plain:
     return Plain(np.array(events, np.int64), np.array(times), found, frames, frames, starts_at_zero=False)
 
 
+def plain_m3ed(folder: Path) -> Plain:
+    with h5py.File(folder / "seq_data.h5") as file:
+        columns = [file[f"prophesee/left/{name}"][...].astype(np.int64) for name in "xytp"]  # type: ignore[index]
+        stamps = file["ovc/ts"][...].astype(np.int64) * 1000  # type: ignore[index]
+    with h5py.File(folder / "seq_pose_gt.h5") as file:
+        times, poses = file["ts"][...].astype(np.int64), np.linalg.inv(file["Cn_T_C0"][...])  # type: ignore[index]
+    return Plain(np.stack(columns, axis=1) * [1, 1, 1000, 1], times * 1000, poses, stamps, stamps)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -346,6 +360,7 @@ LAYOUTS = {
         )
         for ros in (1, 2)
     },
+    "m3ed": Layout("m3ed", write_m3ed, plain_m3ed),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -378,7 +393,7 @@ OPTIONAL_KEYS = (
 )
 LISTS_OF_ANY_LENGTH = ("frames", "distortion")
 
-TIMES, COORDINATES, POLARITIES = ("t", "timestamp", "T_wc_timestamp"), ("x", "y", "position"), ("p", "polarity")
+TIMES, COORDINATES, POLARITIES = ("t", "ts", "timestamp", "T_wc_timestamp"), ("x", "y", "position"), ("p", "polarity")
 ARRAYS_OF_ANY_LENGTH = ("rows", "poses_bounds", "distortion_params")
 
 OUTSIDE = (-1, 1280, 2**16 + 3, 2**31 + 3, 2**32 + 3, 2**40, -(2**32) + 3)
@@ -610,8 +625,9 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
         np.savez(path, **arrays, **{} if is_removed else {name: array})
         return "refused" if is_removed else outcome
     with h5py.File(path, "r+") as file:
-        group: Any = file["events"] if "events" in file else file
-        name = draw(st.sampled_from([name for name in ("x", "y", "t", "p", "rectify_map") if name in group]))
+        group: Any = next((file[name] for name in ("events", "prophesee/left") if name in file), file)
+        names = ("x", "y", "t", "p", "rectify_map", "ts", "Cn_T_C0")
+        name = draw(st.sampled_from([name for name in names if name in group]))
         kind = draw(st.sampled_from(["removed", *["exchanged"] * (name in "xy"), *["changed"] * 8]))
         note(f"{name}: {kind}")
         if kind == "exchanged":

@@ -79,7 +79,7 @@ def test_read_folder_finds_the_format_and_reads_a_folder_once(tmp_path: Path, mo
 
 def test_the_formats_of_the_package():
     assert [format.name for format in formats()] == [
-        *("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "ros_bag", "event_recording"),
+        *("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "ros_bag", "m3ed", "event_recording"),
     ]
     assert layouts() == ("esim", "eds", "tum_vie", "event_recording")
     for format in formats():
@@ -126,7 +126,7 @@ def test_options_that_the_format_lacks(basket: Path, tmp_path: Path):
     esim = write_esim(tmp_path / "esim")
     with pytest.raises(FlagError, match=r"^--basket is for recordings of basket, but .*esim is read as esim; leave it"):
         read_recording(esim, basket="red")
-    with pytest.raises(FlagError, match=r"^--event-camera is for recordings of tum_vie and basket, but .* as esim"):
+    with pytest.raises(FlagError, match=r"^--event-camera is for recordings of tum_vie.* and basket, but .* as esim"):
         read_recording(esim, "esim", event_camera="left")
     with pytest.raises(FlagError, match=r"^--lid-open is no option of any format, but .* is read as basket"):
         read_recording(basket, lid_open=True)
