@@ -109,6 +109,7 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "esim_npz": ("camera_calibration.npz",),
             "esim_bag": ("esim.bag", "esim.conf"),
             "ros_bag_2": ("metadata.yaml", "bag.db3"),
+            "dsec": ("calibration/cam_to_cam.yaml", "images/left/exposure_timestamps.txt"),
             "m3ed": ("seq_pose_gt.h5",),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),

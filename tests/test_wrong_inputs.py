@@ -106,6 +106,12 @@ FILES: dict[str, tuple[str, ...]] = {
     "esim_bag": ("esim.bag",),
     "ros_bag_1": ("recording.bag",),
     "ros_bag_2": ("bag.db3",),
+    "dsec": (
+        "events/left/events.h5",
+        "calibration/cam_to_cam.yaml",
+        "poses.txt",
+        "images/left/exposure_timestamps.txt",
+    ),
     "m3ed": ("seq_data.h5", "seq_pose_gt.h5"),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
@@ -117,6 +123,7 @@ OPTIONAL: dict[str, tuple[str, ...]] = {
     "eds_prepared": ("rectify_map_calib0.h5",),
     "tum_vie_prepared": ("calibration.json", "rectify_map_left.h5"),
     "esim": ("simulation.json", "0_poses_all.txt"),
+    "dsec": ("events/left/rectify_map.h5",),
     "esim_npz": ("views/transforms_test.json",),
 }
 """Files that may be missing, or whose lack a table of the layout has, but that must be sound where they are there."""

@@ -12,7 +12,18 @@ from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
-from enerf_ns.dataparsers.formats import davis, eds, esim, esim_bag, esim_npz, event_recording, m3ed, ros_bag, tum_vie
+from enerf_ns.dataparsers.formats import (
+    davis,
+    dsec,
+    eds,
+    esim,
+    esim_bag,
+    esim_npz,
+    event_recording,
+    m3ed,
+    ros_bag,
+    tum_vie,
+)
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
@@ -126,7 +137,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, m3ed, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, m3ed, dsec, event_recording):
     register(_module.FORMAT)
 
 

@@ -27,6 +27,7 @@ import h5py
 import numpy as np
 import psutil
 import pytest
+import test_dsec
 import test_eds
 import test_esim_npz
 import test_event_recording
@@ -149,6 +150,12 @@ def write_ros_bag(folder: Path, ros: int) -> None:
 
 def write_m3ed(folder: Path) -> None:
     test_m3ed.write_m3ed(folder, events=EVENTS)
+
+
+def write_dsec(folder: Path) -> None:
+    test_dsec.write_dsec(folder, events=EVENTS)
+    for place in ("events", "images"):
+        shutil.rmtree(folder / place / "right")
 
 
 def write_own(folder: Path) -> None:
@@ -324,6 +331,21 @@ def plain_m3ed(folder: Path) -> Plain:
     return Plain(np.stack(columns, axis=1) * [1, 1, 1000, 1], times * 1000, poses, stamps, stamps)
 
 
+def plain_dsec(folder: Path) -> Plain:
+    with h5py.File(folder / "events/left/events.h5") as file:
+        offset = int(file["t_offset"][()])  # type: ignore[index]
+    events = hdf5_events(folder / "events/left/events.h5") + [0, 0, 1000 * offset, 0]
+    spans = np.array(
+        [
+            [int(Fraction(cell) * 1000) for cell in line.split(",")]
+            for line in (folder / "images/left/exposure_timestamps.txt").read_text().splitlines()[1:]
+            if line.strip()
+        ]
+    )
+    middles = spans[:, 0] + (spans[:, 1] - spans[:, 0]) // 2
+    return Plain(events, *poses_in(folder / "poses.txt", "s"), middles, middles, starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -361,6 +383,7 @@ LAYOUTS = {
         for ros in (1, 2)
     },
     "m3ed": Layout("m3ed", write_m3ed, plain_m3ed),
+    "dsec": Layout("dsec", write_dsec, plain_dsec, ("timestamps.txt", "rectify_map.h5")),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -376,7 +399,7 @@ WITH_CHECKSUMS = (".npz", ".png")
 
 KINDS_OF_TABLES = {
     "poses": ("*groundtruth*", "*poses*", "mocap_data.txt"),
-    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt"),
+    "stamps": ("image_stamps*", "image*_timestamps*", "timestamps.txt", "stamps_ns.txt", "images.txt"),
     "events": ("events.txt",),
     "exposures": ("image_exposures*",),
     "others": ("*",),
