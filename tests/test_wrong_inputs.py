@@ -123,7 +123,7 @@ OPTIONAL: dict[str, tuple[str, ...]] = {
     "eds_prepared": ("rectify_map_calib0.h5",),
     "tum_vie_prepared": ("calibration.json", "rectify_map_left.h5"),
     "esim": ("simulation.json", "0_poses_all.txt"),
-    "dsec": ("events/left/rectify_map.h5",),
+    "dsec": ("events/left/rectify_map.h5", "images/left/exposure_timestamps.txt"),
     "esim_npz": ("views/transforms_test.json",),
 }
 """Files that may be missing, or whose lack a table of the layout has, but that must be sound where they are there."""

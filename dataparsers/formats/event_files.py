@@ -315,6 +315,22 @@ def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
     return (int(sensor["width"]), int(sensor["height"])), events
 
 
+def read_exposures(path: Path) -> Int64[np.ndarray, "frames 2"]:
+    """Returns begin and end (ns on the clock of the file) of the exposure of each frame in an AEDAT4 file.
+
+    Raises:
+        RecordingError: The file is damaged, or aedat is not installed.
+    """
+    aedat = _import("aedat", path)
+    _check_aedat4(path)
+    decoder = _guarded(path, lambda: aedat.Decoder(path))
+    found = []
+    while (packet := _guarded(path, lambda: next(decoder, None))) is not None:
+        if "frame" in packet:
+            found.append((packet["frame"]["exposure_begin_t"], packet["frame"]["exposure_end_t"]))
+    return np.array(found, np.int64).reshape(-1, 2) * 1000
+
+
 def _check_aedat4(path: Path) -> None:
     """Raises RecordingError if parts of an AEDAT4 file are not where it states. The package would end the process.
 

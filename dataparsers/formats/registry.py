@@ -15,6 +15,7 @@ from pathlib import Path
 from enerf_ns.dataparsers.formats import (
     davis,
     dsec,
+    e2nerf,
     eds,
     esim,
     esim_bag,
@@ -137,7 +138,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
     return writer_of(layout)(folder, setup)
 
 
-for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, m3ed, dsec, event_recording):
+for _module in (esim, esim_npz, esim_bag, davis, eds, tum_vie, ros_bag, m3ed, dsec, e2nerf, event_recording):
     register(_module.FORMAT)
 
 

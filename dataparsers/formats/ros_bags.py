@@ -66,6 +66,9 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
                 if b"\n" not in (start := file.read(len(MAGIC))) or start[:9] != MAGIC[:9]:
                     raise ValueError(f"it does not begin with {MAGIC[:-1].decode()}")
         with AnyReader([path], default_typestore=store) as bag:
+            for connection in bag.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    raise ValueError(f"it names a topic {connection.topic!r} of type {connection.msgtype!r}")
             yield bag
 
 

@@ -47,8 +47,8 @@ def parse_yaml(path: Path, text: str, expected: str) -> Value:
         """Reads 1e-05 as a number. YAML 1.1 takes it for text."""
 
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"])
-    loader = Loader(text)
     try:
+        loader = Loader(text)
         node = loader.get_single_node()
         if node is not None:
             _num_values(node, {})

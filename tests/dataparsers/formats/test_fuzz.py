@@ -158,6 +158,15 @@ def write_dsec(folder: Path) -> None:
         shutil.rmtree(folder / place / "right")
 
 
+def write_e2nerf(folder: Path) -> None:
+    pytest.importorskip("aedat", reason="aedat is an optional extra of the project")
+    import test_e2nerf
+
+    test_e2nerf.write_scene(folder)
+    for file in (folder / "events.pt", *(image for image in folder.rglob("*.jpg") if int(image.stem) % 5)):
+        file.unlink()  # that nobody reads
+
+
 def write_own(folder: Path) -> None:
     camera = {**test_event_recording.CAMERA, "model": "radtan", "distortion": [-0.1, 0.02, 0.001, -0.002]}
     test_event_recording.write_recording(
@@ -328,22 +337,41 @@ def plain_m3ed(folder: Path) -> Plain:
         stamps = file["ovc/ts"][...].astype(np.int64) * 1000  # type: ignore[index]
     with h5py.File(folder / "seq_pose_gt.h5") as file:
         times, poses = file["ts"][...].astype(np.int64), np.linalg.inv(file["Cn_T_C0"][...])  # type: ignore[index]
+        poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()  # the closest rotations
     return Plain(np.stack(columns, axis=1) * [1, 1, 1000, 1], times * 1000, poses, stamps, stamps)
 
 
 def plain_dsec(folder: Path) -> Plain:
     with h5py.File(folder / "events/left/events.h5") as file:
         offset = int(file["t_offset"][()])  # type: ignore[index]
-    events = hdf5_events(folder / "events/left/events.h5") + [0, 0, 1000 * offset, 0]
-    spans = np.array(
-        [
-            [int(Fraction(cell) * 1000) for cell in line.split(",")]
-            for line in (folder / "images/left/exposure_timestamps.txt").read_text().splitlines()[1:]
-            if line.strip()
-        ]
-    )
-    middles = spans[:, 0] + (spans[:, 1] - spans[:, 0]) // 2
+    events = hdf5_events(folder / "events/left/events.h5") + np.array([0, 0, 1000 * offset, 0])
+    exposures = folder / "images/left/exposure_timestamps.txt"
+    if exposures.exists():
+        rows = [re.split(r"[,\s]+", line.strip()) for line in exposures.read_text().splitlines()[1:] if line.strip()]
+        spans = np.array([[int(Fraction(cell) * 1000) for cell in row] for row in rows])
+        middles = spans[:, 0] + (spans[:, 1] - spans[:, 0]) // 2
+    else:
+        middles = stamps_in(folder, "images/timestamps.txt", "us")
     return Plain(events, *poses_in(folder / "poses.txt", "s"), middles, middles, starts_at_zero=False)
+
+
+def plain_e2nerf(folder: Path) -> Plain:
+    import aedat
+    from test_e2nerf import VIEWS
+
+    events, exposures = [], []
+    for packet in aedat.Decoder(folder / "lego.aedat4"):
+        if "events" in packet:
+            rows = packet["events"]
+            events.append(np.column_stack([rows["x"], rows["y"], rows["t"] * 1000, rows["on"]]).astype(np.int64))
+        if "frame" in packet:
+            exposures.append([packet["frame"]["exposure_begin_t"] * 1000, packet["frame"]["exposure_end_t"] * 1000])
+    views = np.array(exposures[: 10 * VIEWS : 10], np.int64)
+    llff = np.load(folder / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5).astype(np.float64)
+    turns = np.stack([llff[..., 1], llff[..., 0], -llff[..., 2]], axis=-1)
+    poses = matrices(llff[..., 3], Rotation.from_matrix(turns).as_quat())
+    times, none = (views[:, :1] + 25_001_000 * np.arange(5)).ravel(), np.zeros(0, np.int64)
+    return Plain(np.concatenate(events), times, poses, none, none, starts_at_zero=False)
 
 
 def plain_own(folder: Path) -> Plain:
@@ -383,7 +411,8 @@ LAYOUTS = {
         for ros in (1, 2)
     },
     "m3ed": Layout("m3ed", write_m3ed, plain_m3ed),
-    "dsec": Layout("dsec", write_dsec, plain_dsec, ("timestamps.txt", "rectify_map.h5")),
+    "dsec": Layout("dsec", write_dsec, plain_dsec, ("timestamps.txt", "exposure_timestamps.txt", "rectify_map.h5")),
+    "e2nerf": Layout("e2nerf", write_e2nerf, plain_e2nerf, lists_images=True),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -543,7 +572,7 @@ def damage_tree(draw: Draw, layout: Layout, path: Path) -> Outcome:
         inside = inside[step]
     kind = draw(st.sampled_from(["no value", "odd value", "null", "removed", "doubled"]))
     note(f"{[*above, key]}: {kind}")
-    outcome: Outcome = "refused or the same"
+    outcome: Outcome = "refused or plain" if above[-1:] == ["topic_metadata"] else "refused or the same"
     if kind == "no value":
         inside[key] = draw(st.sampled_from(NO_VALUES))
     elif kind == "odd value":

@@ -79,7 +79,19 @@ def test_read_folder_finds_the_format_and_reads_a_folder_once(tmp_path: Path, mo
 
 def test_the_formats_of_the_package():
     assert [format.name for format in formats()] == [
-        *("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "ros_bag", "m3ed", "dsec", "event_recording"),
+        *(
+            "esim",
+            "esim_npz",
+            "esim_bag",
+            "davis",
+            "eds",
+            "tum_vie",
+            "ros_bag",
+            "m3ed",
+            "dsec",
+            "e2nerf",
+            "event_recording",
+        ),
     ]
     assert layouts() == ("esim", "eds", "tum_vie", "event_recording")
     for format in formats():
