@@ -73,6 +73,8 @@ def open_event_file(path: Path) -> EventFile:
         begin = file.read(LARGEST_HEADER)
     if not begin:
         raise RecordingError(f"{path} is empty; an event file was expected.")
+    if begin.startswith(b"#ROSBAG") or path.suffix in (".db3", ".mcap"):
+        raise RecordingError(f"{path} is a ROS bag, which is read as a recording; give the folder that it lies in.")
     if begin.startswith(AEDAT4_MAGIC):
         encoding, (size, microseconds) = "AEDAT4", _open_aedat4(path)
     elif begin.startswith(b"%"):
