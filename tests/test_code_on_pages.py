@@ -258,28 +258,6 @@ def arrays(recording: Path) -> dict[str, Any]:
     }
 
 
-def write_bag(path: Path, recording: Path) -> int:
-    """Writes 500 events and all poses of a recording as a bag of ROS 1; returns the number of events."""
-    bags = import_module("test_esim_bag")
-    given = arrays(recording)
-    messages: list[tuple[str, int, object]] = []
-    for x, y, t, p in list(zip(*(given[name].tolist() for name in "xytp"), strict=True))[:500]:
-        event = bags.message("dvs_msgs/msg/Event", x=x, y=y, ts=bags.time(t), polarity=p > 0)
-        held = bags.message("dvs_msgs/msg/EventArray", header=bags.header(t), height=24, width=32, events=[event])
-        messages.append(("/dvs/events", t, held))
-    for time, pose in zip(given["pose_times"].tolist(), given["poses"].tolist(), strict=True):
-        place = bags.message("geometry_msgs/msg/Point", **dict(zip("xyz", pose[:3], strict=True)))
-        turn = bags.message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", pose[3:], strict=True)))
-        stamped = bags.message(
-            "geometry_msgs/msg/PoseStamped",
-            header=bags.header(time),
-            pose=bags.message("geometry_msgs/msg/Pose", position=place, orientation=turn),
-        )
-        messages.append(("/optitrack/davis", time, stamped))
-    bags.write_bag(path, messages)
-    return 500
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
@@ -289,13 +267,8 @@ def write_bag(path: Path, recording: Path) -> int:
 def test_examples_in_python_run(page: Path, folder: Path, recording: Path):
     """The blocks of a page run one after another, as a reader would paste them."""
     names: dict[str, Any] = {"__name__": "page", "read": read_recording, **arrays(recording)}
-    if page.name == "tutorial-files-and-bags.md":
-        pytest.importorskip("rosbags")
-        expected = write_bag(folder / "recording.bag", recording)
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), names)
-    if page.name == "tutorial-files-and-bags.md":
-        assert len(names["t"]) == expected and len(names["poses"]) == len(arrays(recording)["poses"])
     if page.name == "tutorial-numpy.md":
         assert len(index_events(read_recording(folder / "my-recording"))) > 0
 

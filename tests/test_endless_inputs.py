@@ -112,6 +112,9 @@ ENDLESS: dict[str, tuple[str, str, Place]] = {
             "eventnerf": ("train/events/test.npz", "train/pose/r_00000.txt", "train/intrinsics/r_00003.txt"),
             "mvsec": ("indoor_flying1_gt.hdf5", "camchain-imucam-indoor_flying.yaml"),
             "vector": ("desk_normal1.synced.gt.txt", "camera_mocap_extrinsic_results1.yaml"),
+            "ros_bag_2": ("metadata.yaml", "bag.db3"),
+            "dsec": ("calibration/cam_to_cam.yaml", "images/left/exposure_timestamps.txt"),
+            "m3ed": ("seq_pose_gt.h5",),
             "small esim": ("simulation.json", "poses_bounds.npy", "images/image_stamps_ns.txt"),
             "file": ("recording.raw",),
         }.items()

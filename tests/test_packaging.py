@@ -125,7 +125,7 @@ def test_entry_points_are_specifications():
     assert {point.name for point in ENTRY_POINTS} >= {
         "enerf", "enerf-paper", "event-data", "esim-events", "esim-npz", "esim-bag", "davis-events", "eds-events",
         "tumvie-events", "eventnerf-events", "llff-events", "evimo2-events", "mvsec-events", "vector-events",
-        "event-recording", *PUBLISHED_LOSSES,
+        "rosbag-events", "m3ed-events", "dsec-events", "e2nerf-events", "event-recording", *PUBLISHED_LOSSES,
     }  # fmt: skip
     for point in ENTRY_POINTS:
         assert type(point.load()).__name__ == SPECIFICATIONS[point.group]

@@ -124,6 +124,15 @@ FILES: dict[str, tuple[str, ...]] = {
     ),
     "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5"),
     "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
+    "ros_bag_1": ("recording.bag",),
+    "ros_bag_2": ("bag.db3",),
+    "dsec": (
+        "events/left/events.h5",
+        "calibration/cam_to_cam.yaml",
+        "poses.txt",
+        "images/left/exposure_timestamps.txt",
+    ),
+    "m3ed": ("seq_data.h5", "seq_pose_gt.h5"),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -134,6 +143,7 @@ OPTIONAL: dict[str, tuple[str, ...]] = {
     "eds_prepared": ("rectify_map_calib0.h5",),
     "tum_vie_prepared": ("calibration.json", "rectify_map_left.h5"),
     "esim": ("simulation.json", "0_poses_all.txt"),
+    "dsec": ("events/left/rectify_map.h5", "images/left/exposure_timestamps.txt"),
     "esim_npz": ("views/transforms_test.json",),
 }
 """Files that may be missing, or whose lack a table of the layout has, but that must be sound where they are there."""

@@ -17,7 +17,6 @@ The reader reads the whole bag once to find the poses. Only one chunk of the bag
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,8 @@ from enerf_ns.dataparsers.formats.robust_enerf import (
     read_views,
     whole_nanoseconds,
 )
+from enerf_ns.dataparsers.formats.ros_bags import MAGIC
+from enerf_ns.dataparsers.formats.ros_events import as_events, parse_array
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import of_file, read_text, reading
@@ -41,9 +42,6 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("esim.bag", "esim.conf")
 
-MAGIC = b"#ROSBAG V2.0\n"
-"""First line of a bag. rosbags reads a line of any length before it compares it."""
-
 EVENTS, POSES, CAMERA = "/cam0/events", "/cam0/pose", "/cam0/camera_info"
 
 MESSAGE_TYPES = {
@@ -51,9 +49,6 @@ MESSAGE_TYPES = {
     POSES: "geometry_msgs/msg/PoseStamped",
     CAMERA: "sensor_msgs/msg/CameraInfo",
 }
-
-EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("polarity", "u1")])
-"""A serialized dvs_msgs/Event: 13 bytes."""
 
 COLOUR = "simulate_color_events"
 
@@ -169,23 +164,8 @@ def _read_camera(path: Path) -> Camera:
 
 
 def _parse_events(path: Path, data: bytes) -> tuple[tuple[int, int], np.ndarray]:
-    """Returns the size of the sensor (width, height) and the events of a serialized dvs_msgs/EventArray.
-
-    Its bytes are u32 seq, u32 s, u32 ns, u32 length of the name of the frame, the name, u32 height, u32 width, u32
-    number of events, and the events.
-    """
-    try:
-        (length,) = struct.unpack_from("<I", data, 12)
-        height, width, count = struct.unpack_from("<III", data, 16 + length)
-    except struct.error:
-        length, height, width, count = 0, 0, 0, -1
-    start = 28 + length
-    if len(data) != start + count * EVENT.itemsize:
-        raise RecordingError(
-            f"{path} holds a message on {EVENTS} whose {len(data):,} bytes are no dvs_msgs/EventArray; copy it again "
-            "from its source."
-        )
-    return (width, height), np.frombuffer(data, EVENT, count, start)
+    """Returns the size of the sensor (width, height) and the events of a message."""
+    return parse_array(f"{path} holds a message on {EVENTS}", MESSAGE_TYPES[EVENTS], data)[1:]
 
 
 def _stream_events(path: Path) -> Iterator[Events]:
@@ -202,9 +182,7 @@ def _stream_events(path: Path) -> Iterator[Events]:
 
 
 def _joined(held: list[np.ndarray]) -> Events:
-    events = np.concatenate(held)
-    times = events["s"].astype(np.int64) * 10**9 + events["ns"]
-    return Events(events["x"], events["y"], times, events["polarity"])
+    return as_events(np.concatenate(held))
 
 
 def _read_flags(path: Path) -> tuple[tuple[float, float], int, str | None]:

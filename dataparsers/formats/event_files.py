@@ -73,6 +73,8 @@ def open_event_file(path: Path) -> EventFile:
         begin = file.read(LARGEST_HEADER)
     if not begin:
         raise RecordingError(f"{path} is empty; an event file was expected.")
+    if begin.startswith(b"#ROSBAG") or path.suffix in (".db3", ".mcap"):
+        raise RecordingError(f"{path} is a ROS bag, which is read as a recording; give the folder that it lies in.")
     if begin.startswith(AEDAT4_MAGIC):
         encoding, (size, microseconds) = "AEDAT4", _open_aedat4(path)
     elif begin.startswith(b"%"):
@@ -269,11 +271,28 @@ def _evt21_order(path: Path, words: bytes) -> str:
 
 
 def _decode_evt3(path: Path, pieces: Iterator[np.ndarray]) -> Iterator[Events]:
-    decoder = _import("evt3", path).Decoder()
+    decode = evt3_decoder(path)
     for words in pieces:
+        yield decode(words)
+
+
+def evt3_decoder(path: Path) -> Callable[[np.ndarray], Events]:
+    """Returns a function that decodes one piece of EVT3 words (<u2) after the other; times in microseconds.
+
+    The time counter has 24 bits, which restart after 16.8 s. The function counts on. It holds events back until the
+    first word of time. It raises RecordingError at a word that EVT3 has not.
+
+    Raises:
+        RecordingError: The package evt3 is not installed.
+    """
+    decoder = _import("evt3", path).Decoder()
+
+    def decode(words: np.ndarray) -> Events:
         _check_types(path, words >> 12, EVT3_TYPES, "EVT3")
         events = decoder.feed(words.tobytes())
-        yield Events(events.x, events.y, events.t.astype(np.int64), events.p)
+        return Events(events.x, events.y, events.t.astype(np.int64), events.p)
+
+    return decode
 
 
 def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
@@ -296,6 +315,22 @@ def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
                 yield Events(rows["x"], rows["y"], rows["t"].astype(np.int64), rows["on"])
 
     return (int(sensor["width"]), int(sensor["height"])), events
+
+
+def read_exposures(path: Path) -> Int64[np.ndarray, "frames 2"]:
+    """Returns begin and end (ns on the clock of the file) of the exposure of each frame in an AEDAT4 file.
+
+    Raises:
+        RecordingError: The file is damaged, or aedat is not installed.
+    """
+    aedat = _import("aedat", path)
+    _check_aedat4(path)
+    decoder = _guarded(path, lambda: aedat.Decoder(path))
+    found = []
+    while (packet := _guarded(path, lambda: next(decoder, None))) is not None:
+        if "frame" in packet:
+            found.append((packet["frame"]["exposure_begin_t"], packet["frame"]["exposure_end_t"]))
+    return np.array(found, np.int64).reshape(-1, 2) * 1000
 
 
 def _check_aedat4(path: Path) -> None:

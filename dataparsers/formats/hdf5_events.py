@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from enerf_ns.dataparsers.formats.columns import check_columns, check_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
+from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, of_file, reading, write_all
 from enerf_ns.dataparsers.recording.hdf5_files import check_filters, member
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
 from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, Times
@@ -46,6 +46,7 @@ class Hdf5Events:
         path: The file.
         unit: Unit of the times, us or ns.
         floats: Whether x, y and t may be floats.
+        group: Group of the datasets x, y, t, p, with / between its parts. Where there is none, they are at the root.
 
     Raises:
         RecordingError: The file is missing, truncated, not HDF5 or empty, lacks a column, has columns of another type
@@ -60,8 +61,8 @@ class Hdf5Events:
     last_time: int
     """Time of the last event, ns on the clock of the file."""
 
-    def __init__(self, path: Path, unit: str = "us", floats: bool = False):
-        self.path, self.unit = path, unit
+    def __init__(self, path: Path, unit: str = "us", floats: bool = False, group: str = "events"):
+        self.path, self.unit, self._group = path, unit, group
         self._cache = SMALLEST_CACHE
         with reading(path, "an HDF5 file with events"), self._open() as file:
             columns = self._columns(file)
@@ -105,27 +106,24 @@ class Hdf5Events:
                 yield Events(x, y, t, p)
 
     def _open(self) -> h5py.File:
-        import h5py
-        import hdf5plugin  # noqa: F401  makes the filters known
-
-        return h5py.File(self.path, "r", locking=False, rdcc_nbytes=self._cache, rdcc_w0=1.0)
+        return open_hdf5(self.path, rdcc_nbytes=self._cache, rdcc_w0=1.0)
 
     def _columns(self, file: h5py.File) -> dict[str, h5py.Dataset]:
         import h5py
 
-        group = member(self.path, file, "events")
+        group = member_at(self.path, file, self._group)
         group = file if group is None else group
         if not isinstance(group, h5py.Group):
             raise RecordingError(
-                f"{self.path} holds a dataset events, but a group of the datasets x, y, t, p was expected."
+                f"{self.path} holds a dataset {self._group}, but a group of the datasets x, y, t, p was expected."
             )
         columns = {name: member(self.path, group, name) for name in COLUMNS}
         missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
         if missing:
-            where = "its group events/" if group.name == "/events" else "its root"
+            where = "its root" if group.name == "/" else f"its group {self._group}/"
             raise RecordingError(
                 f"{self.path} lacks the dataset{'s' * (len(missing) > 1)} {', '.join(missing)} in {where}; events are "
-                "the datasets x, y, t, p in a group events/ or at the root."
+                f"the datasets x, y, t, p in a group {self._group}/ or at the root."
             )
         return columns  # type: ignore[return-value]
 
@@ -172,10 +170,9 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
         RecordingError: The file is missing, truncated or not HDF5, or holds no such map of the size of the camera.
     """
     import h5py
-    import hdf5plugin  # noqa: F401  makes the filters known
 
     height, width = undistorted.height, undistorted.width
-    with reading(path, "an HDF5 file with a rectify map"), h5py.File(path, "r", locking=False) as file:
+    with reading(path, "an HDF5 file with a rectify map"), open_hdf5(path) as file:
         dataset = member(path, file, "rectify_map")
         if not isinstance(dataset, h5py.Dataset):
             raise RecordingError(f"{path} lacks the dataset rectify_map, which was expected.")
@@ -197,6 +194,69 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
     directions = (rectify_map.astype(np.float64) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     with of_file(path):
         return replace(undistorted, model="lookup", directions=directions)
+
+
+def open_hdf5(path: Path, **options: Any) -> h5py.File:
+    """Returns an HDF5 file that is open for reading, with the filters of hdf5plugin; options are those of h5py."""
+    import h5py
+    import hdf5plugin  # noqa: F401  makes the filters known
+
+    return h5py.File(path, "r", locking=False, **options)
+
+
+def member_at(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
+    """Returns the member with this name, which has / between its parts, or None. It raises what `member` raises."""
+    import h5py
+
+    *above, last = name.split("/")
+    for part in above:
+        inner = member(path, group, part)
+        if not isinstance(inner, h5py.Group):
+            return None
+        group = inner
+    return member(path, group, last)
+
+
+def read_dataset(path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Returns a dataset of real numbers that is read as a whole.
+
+    Args:
+        path: The file, for error messages.
+        file: The same, opened.
+        name: Name of the dataset, with / between its parts.
+        expected: The expected content, such as "poses, 4 x 4 numbers each".
+        shape: Its shape, with None for a length that is free.
+
+    Raises:
+        RecordingError: It is missing, has another shape or type, is larger than `LARGEST_ARRAY`, or cannot be read.
+    """
+    dataset = dataset_at(path, file, name, expected, shape)
+    if dataset.size * dataset.dtype.itemsize > LARGEST_ARRAY:
+        raise RecordingError(
+            f"{path} holds {name} of {dataset.size:,} numbers, but {expected} of at most {LARGEST_ARRAY:,} bytes was "
+            "expected; give a part of it."
+        )
+    return np.asarray(dataset[...])
+
+
+def dataset_at(path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...]) -> h5py.Dataset:
+    """Returns a dataset of real numbers, of which only the header is read, as `read_dataset` does."""
+    import h5py
+
+    dataset = member_at(path, file, name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise RecordingError(f"{path} lacks the dataset {name}, {expected}; get the file as it is published.")
+    fits = len(dataset.shape) == len(shape) and all(
+        want in (None, length) for want, length in zip(shape, dataset.shape, strict=True)
+    )
+    if not fits or dataset.dtype.kind not in "iuf":
+        wanted = " x ".join("n" if length is None else str(length) for length in shape) or "one number"
+        raise RecordingError(
+            f"{path} holds {name} as {dataset.dtype} of shape {dataset.shape}, but numbers of shape {wanted} were "
+            f"expected: {expected}."
+        )
+    check_filters(path, dataset)
+    return dataset
 
 
 def _chunk_bytes(dataset: h5py.Dataset) -> int:

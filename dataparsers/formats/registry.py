@@ -14,6 +14,8 @@ from pathlib import Path
 
 from enerf_ns.dataparsers.formats import (
     davis,
+    dsec,
+    e2nerf,
     eds,
     esim,
     esim_bag,
@@ -22,7 +24,9 @@ from enerf_ns.dataparsers.formats import (
     eventnerf,
     evimo2,
     llff_events,
+    m3ed,
     mvsec,
+    ros_bag,
     tum_vie,
     vector,
 )
@@ -30,6 +34,7 @@ from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
+from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording
@@ -140,7 +145,7 @@ def open_writer(layout: str, folder: Path, setup: Setup) -> Writer:
 
 for _module in (
     *(esim, esim_npz, esim_bag, davis, eds, tum_vie, eventnerf, llff_events, evimo2, mvsec, vector),
-    event_recording,
+    *(ros_bag, m3ed, dsec, e2nerf, event_recording),
 ):
     register(_module.FORMAT)
 
@@ -161,6 +166,8 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
                 "own poses; convert it without --poses, and give --poses with the new recording."
             )
         options["poses"] = poses
+    if "ENERF_CACHE" in os.environ:
+        check_outside_recordings("ENERF_CACHE", cache_folder())
     name_links_out(path)
     try:
         with of_file(path):
@@ -207,8 +214,11 @@ def _files_found(path: Path) -> dict[Format, int]:
 
 
 def _find_format(path: Path) -> Format:
-    """Returns the format with the most files in a folder."""
-    found = _files_found(path)
+    """Returns the format with the most files in a folder. Exact names count a little more than patterns."""
+    found = {
+        format: count + 0.1 * sum((path / name).exists() for name in format.files)
+        for format, count in _files_found(path).items()
+    }
     best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) == 1:
         return best[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.columns import unit_quaternions
 from enerf_ns.dataparsers.formats.json_values import in_words
+from enerf_ns.dataparsers.formats.ros_bags import messages_on, open_bag
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import reading
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 POSE_TYPES: dict[str, Callable[[Any], list[tuple[Any, Any]]]] = {
@@ -31,7 +32,23 @@ Rows = tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float6
 """Times (ns), positions (metres) and quaternions of poses, in order of time."""
 
 
-def read_bag(path: Path, topic: str | None, frames: tuple[str, str] | None, notes: list[str]) -> Rows:
+@dataclass(frozen=True)
+class PoseFlagNames:
+    """Flags that choose the poses of a bag, as errors name them."""
+
+    topic: str = "--poses-topic"
+    frames: str = "--poses-frames"
+    otherwise: str = ""
+    """Words for another way to poses where a bag has none, such as ", or do so"."""
+
+
+def read_bag(
+    path: Path,
+    topic: str | None,
+    frames: tuple[str, str] | None,
+    notes: list[str],
+    flags: PoseFlagNames = PoseFlagNames(),
+) -> Rows:
     """Returns the poses of a bag as they are written.
 
     Args:
@@ -39,6 +56,7 @@ def read_bag(path: Path, topic: str | None, frames: tuple[str, str] | None, note
         topic: Topic of the poses. Default: the only one with poses.
         frames: Names of the world and of the camera in the tree of tf. Default: the poses of a topic.
         notes: Gets sentences on repeated stamps and renormalised quaternions.
+        flags: Names of the flags of topic and frames.
 
     Raises:
         RecordingError: The bag is damaged or lacks such poses, or rosbags is not installed.
@@ -46,45 +64,39 @@ def read_bag(path: Path, topic: str | None, frames: tuple[str, str] | None, note
     """
     if frames is not None:
         if topic is not None:
-            raise FlagError("--poses-topic and --poses-frames were both given, but one is enough; leave one out.")
-        return _between_frames(path, *frames, notes)
+            raise FlagError(f"{flags.topic} and {flags.frames} were both given, but one is enough; leave one out.")
+        return _between_frames(path, *frames, notes, flags)
     found = [
         _row(stamp, pose.position, pose.orientation)
-        for kind, message in _messages(path, POSE_TYPES, topic)
+        for kind, message in _messages(path, POSE_TYPES, topic, flags)
         for stamp, pose in POSE_TYPES[kind](message)
     ]
     return _in_order(path, found, notes)
 
 
-def _messages(path: Path, kinds: Collection[str], topic: str | None = None) -> Iterator[tuple[str, Any]]:
+def _messages(
+    path: Path, kinds: Collection[str], topic: str | None = None, flags: PoseFlagNames = PoseFlagNames()
+) -> Iterator[tuple[str, Any]]:
     """Yields type and content of the messages of these types: on one topic, or of tf on all topics."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise RecordingError(
-            f"{path} is a ROS bag, for which the package rosbags is missing; pip install 'enerf-ns[bag]'."
-        ) from error
-    with (
-        reading(path / "metadata.yaml" if path.is_dir() else path, "a ROS bag"),
-        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag,
-    ):
+    with open_bag(path) as bag:
         able = [connection for connection in bag.connections if connection.msgtype in kinds]
         if kinds is POSE_TYPES:
             topics = sorted({connection.topic for connection in able})
             if topic not in topics if topic else len(topics) != 1:
                 what = f"no poses on {topic}" if topic else f"{len(topics)} topics with poses"
-                choice = f"give --poses-topic as one of {in_words(topics)}" if topics else _of_tf(bag.connections)
+                choice = (
+                    f"give {flags.topic} as one of {in_words(topics)}" if topics else _of_tf(bag.connections, flags)
+                )
                 raise FlagError(f"{path} holds {what}; {choice}.")
             able = [connection for connection in able if connection.topic == (topic or topics[0])]
-        for connection, _, data in bag.messages(able):
+        for connection, data in messages_on(bag, able):
             yield connection.msgtype, bag.deserialize(data, connection.msgtype)
 
 
-def _of_tf(connections: Collection[Any]) -> str:
+def _of_tf(connections: Collection[Any], flags: PoseFlagNames) -> str:
     if any(connection.msgtype in TF_TYPES for connection in connections):
-        return "give --poses-frames WORLD CAMERA, two frames of its tf"
-    return f"record one of {in_words([*POSE_TYPES])}, or tf"
+        return f"give {flags.frames} WORLD CAMERA, two frames of its tf"
+    return f"record one of {in_words([*POSE_TYPES])}, or tf{flags.otherwise}"
 
 
 def _row(stamp: Any, position: Any, turn: Any) -> tuple[int, list[float]]:
@@ -105,7 +117,7 @@ def _in_order(path: Path, found: list[tuple[int, list[float]]], notes: list[str]
     return times, values[:, :3], quaternions
 
 
-def _between_frames(path: Path, world: str, camera: str, notes: list[str]) -> Rows:
+def _between_frames(path: Path, world: str, camera: str, notes: list[str], flags: PoseFlagNames) -> Rows:
     """Returns the poses of a frame of tf in another one, at the stamps of the frame between them that moves most often.
 
     The other frames between them are interpolated at these stamps.
@@ -118,6 +130,10 @@ def _between_frames(path: Path, world: str, camera: str, notes: list[str]) -> Ro
             parents[child] = one.header.frame_id.strip("/")
             moved = one.transform
             found.setdefault(child, []).append(_row(one.header.stamp, moved.translation, moved.rotation))
+    if not parents:
+        raise RecordingError(
+            f"{path} holds no tf, but {flags.frames} names two of its frames; record /tf, or leave it out."
+        )
     ways = []
     for name, flag in ((world, "The first"), (camera, "The second")):
         way = [name.strip("/")]
@@ -126,7 +142,7 @@ def _between_frames(path: Path, world: str, camera: str, notes: list[str]) -> Ro
         if way[0] not in parents and way[0] not in parents.values():
             known = in_words(sorted({*parents, *parents.values()}))
             raise FlagError(
-                f"{flag} of --poses-frames is {name}, but {path} holds the frames {known}; give two of them."
+                f"{flag} of {flags.frames} is {name}, but {path} holds the frames {known}; give two of them."
             )
         ways.append(way)
     up, down = ways

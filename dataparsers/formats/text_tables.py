@@ -18,14 +18,15 @@ MOST_ROWS = 2_000_000
 """Most rows of a table: those of half an hour at a thousand poses per second."""
 
 
-def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
-    """Returns the cells of a table whose columns are separated by white space.
+def read_rows(path: Path, columns: str, separator: str = " ") -> tuple[list[list[str]], list[int]]:
+    """Returns the cells of a table whose columns are separated by white space, or also by another separator.
 
     Empty lines, lines that start with "#" and a first line without any number are ignored.
 
     Args:
         path: The file.
         columns: The names of the columns, separated by spaces.
+        separator: What counts as a space, such as a comma.
 
     Returns:
         The cells of each row, and the number of its line in the file, from 1.
@@ -44,7 +45,7 @@ def read_rows(path: Path, columns: str) -> tuple[list[list[str]], list[int]]:
                     f"{path}, line {number} has more than {LONGEST_LINE:,} letters, but {count} columns were expected: "
                     f"{columns}."
                 )
-            cells = line.split()
+            cells = line.replace(separator, " ").split()
             if not cells or line.startswith("#") or (number == 1 and all(_number(cell) is None for cell in cells)):
                 continue
             if len(cells) != count:

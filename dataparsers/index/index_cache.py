@@ -6,7 +6,6 @@ then renamed, so that an entry is always whole, however many processes write it 
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -18,12 +17,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 import torch
-from platformdirs import user_cache_path
 
-from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.dataparsers.index.event_survey import EventStream, Survey, sorted_bands
-from enerf_ns.dataparsers.recording.files import expanded, partial_of
+from enerf_ns.dataparsers.recording.cache import cache_folder
+from enerf_ns.dataparsers.recording.files import partial_of
 
 LAYOUT = 3
 """Version of an entry's content. It grows when the content changes."""
@@ -36,27 +34,6 @@ COLUMNS = {"times": np.int64, "positives": np.int32, "counts": np.int32}
 
 BLOCK = 2**22
 """Bytes that are read at once for a checksum."""
-
-
-def cache_folder() -> Path:
-    """Folder of the indices: $ENERF_CACHE, else `enerf-ns/indices` in the user's cache folder.
-
-    Raises:
-        OSError: The user has no home folder.
-        OutputError: $ENERF_CACHE lies within a recording.
-    """
-    if "ENERF_CACHE" in os.environ:
-        folder = expanded(os.environ["ENERF_CACHE"])
-        check_outside_recordings("ENERF_CACHE", folder)
-        return folder
-    unknown = FileNotFoundError(errno.ENOENT, "no home folder is known", "~")
-    try:
-        folder = user_cache_path("enerf-ns", appauthor=False) / "indices"
-    except RuntimeError as error:  # platformdirs from 4.9 on raises it; earlier ones return a folder named ~
-        raise unknown from error
-    if not folder.is_absolute():
-        raise unknown
-    return folder
 
 
 def entry_name(**made_from: object) -> str:

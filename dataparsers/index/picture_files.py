@@ -11,7 +11,7 @@ import cv2
 from rich import get_console
 from rich.progress import track
 
-from enerf_ns.dataparsers.index.index_cache import cache_folder
+from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import OutputError
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of

@@ -72,6 +72,6 @@ def test_a_folder_that_is_no_recording_is_said_in_one_sentence(tmp_path: Path):
         Inspect(tmp_path / "nowhere", tmp_path / "page.html").main()
     folder = write_esim(tmp_path / "esim")
     right = format_flags()(event_camera="right")  # type: ignore[call-arg] - a field made from the options of TUM-VIE
-    with pytest.raises(FlagError, match=r"--event-camera is for recordings of .* and evimo2, but .* is read as esim"):
+    with pytest.raises(FlagError, match=r"--event-camera is for recordings of tum_vie.*, but .* is read as esim"):
         Inspect(folder, tmp_path / "page.html", right).main()
     assert not (tmp_path / "page.html").exists()

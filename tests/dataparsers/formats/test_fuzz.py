@@ -27,12 +27,14 @@ import h5py
 import numpy as np
 import psutil
 import pytest
+import test_dsec
 import test_eds
 import test_esim_npz
 import test_event_recording
 import test_eventnerf
 import test_evimo2
 import test_llff_events
+import test_m3ed
 import test_mvsec
 import test_tum_vie
 import test_vector
@@ -143,6 +145,32 @@ def write_bag(folder: Path) -> None:
     import test_esim_bag  # here, since it skips where rosbags is not installed
 
     test_esim_bag.write_recording(folder)
+
+
+def write_ros_bag(folder: Path, ros: int) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is an optional extra of the project")
+    import test_ros_bag  # here, since it skips where rosbags is not installed
+
+    test_ros_bag.write_bag(folder, test_ros_bag.Bag(ros, events=EVENTS))
+
+
+def write_m3ed(folder: Path) -> None:
+    test_m3ed.write_m3ed(folder, events=EVENTS)
+
+
+def write_dsec(folder: Path) -> None:
+    test_dsec.write_dsec(folder, events=EVENTS)
+    for place in ("events", "images"):
+        shutil.rmtree(folder / place / "right")
+
+
+def write_e2nerf(folder: Path) -> None:
+    pytest.importorskip("aedat", reason="aedat is an optional extra of the project")
+    import test_e2nerf
+
+    test_e2nerf.write_scene(folder)
+    for file in (folder / "events.pt", *(image for image in folder.rglob("*.jpg") if int(image.stem) % 5)):
+        file.unlink()  # that nobody reads
 
 
 def write_own(folder: Path) -> None:
@@ -336,6 +364,73 @@ def plain_vector(folder: Path) -> Plain:
     return Plain(events, times, poses @ mount, opens + (closes - opens) // 2, opens, starts_at_zero=False)
 
 
+def plain_ros_bag(folder: Path, ros: int) -> Plain:
+    """By the types of the messages, each of which has one topic; on the clock of ROS."""
+    from rosbags.highlevel import AnyReader
+    from test_ros_bag import make_store
+
+    events, times, poses, stamps = [], [], [], []
+    path = folder if (folder / "metadata.yaml").exists() else next(folder.glob("*.bag" if ros == 1 else "*.db3"))
+    with AnyReader([path], default_typestore=make_store(ros)) as bag:
+        for connection, _, data in bag.messages():
+            message: Any = bag.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            if connection.msgtype.endswith("EventArray"):
+                events += [(e.x, e.y, e.ts.sec * 10**9 + e.ts.nanosec, e.polarity) for e in message.events]
+            elif connection.msgtype.endswith("PoseStamped"):
+                times.append(stamp)
+                p, q = message.pose.position, message.pose.orientation
+                poses.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            elif connection.msgtype.endswith("Image"):
+                stamps.append(stamp)
+    rows, frames = np.array(poses), np.array(stamps, np.int64)
+    found = matrices(rows[:, :3], rows[:, 3:])
+    return Plain(np.array(events, np.int64), np.array(times), found, frames, frames, starts_at_zero=False)
+
+
+def plain_m3ed(folder: Path) -> Plain:
+    with h5py.File(folder / "seq_data.h5") as file:
+        columns = [file[f"prophesee/left/{name}"][...].astype(np.int64) for name in "xytp"]  # type: ignore[index]
+        stamps = file["ovc/ts"][...].astype(np.int64) * 1000  # type: ignore[index]
+    with h5py.File(folder / "seq_pose_gt.h5") as file:
+        times, poses = file["ts"][...].astype(np.int64), np.linalg.inv(file["Cn_T_C0"][...])  # type: ignore[index]
+        poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()  # the closest rotations
+    return Plain(np.stack(columns, axis=1) * [1, 1, 1000, 1], times * 1000, poses, stamps, stamps)
+
+
+def plain_dsec(folder: Path) -> Plain:
+    with h5py.File(folder / "events/left/events.h5") as file:
+        offset = int(file["t_offset"][()])  # type: ignore[index]
+    events = hdf5_events(folder / "events/left/events.h5") + np.array([0, 0, 1000 * offset, 0])
+    exposures = folder / "images/left/exposure_timestamps.txt"
+    if exposures.exists():
+        rows = [re.split(r"[,\s]+", line.strip()) for line in exposures.read_text().splitlines()[1:] if line.strip()]
+        spans = np.array([[int(Fraction(cell) * 1000) for cell in row] for row in rows])
+        middles = spans[:, 0] + (spans[:, 1] - spans[:, 0]) // 2
+    else:
+        middles = stamps_in(folder, "images/timestamps.txt", "us")
+    return Plain(events, *poses_in(folder / "poses.txt", "s"), middles, middles, starts_at_zero=False)
+
+
+def plain_e2nerf(folder: Path) -> Plain:
+    import aedat
+    from test_e2nerf import VIEWS
+
+    events, exposures = [], []
+    for packet in aedat.Decoder(folder / "lego.aedat4"):
+        if "events" in packet:
+            rows = packet["events"]
+            events.append(np.column_stack([rows["x"], rows["y"], rows["t"] * 1000, rows["on"]]).astype(np.int64))
+        if "frame" in packet:
+            exposures.append([packet["frame"]["exposure_begin_t"] * 1000, packet["frame"]["exposure_end_t"] * 1000])
+    views = np.array(exposures[: 10 * VIEWS : 10], np.int64)
+    llff = np.load(folder / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5).astype(np.float64)
+    turns = np.stack([llff[..., 1], llff[..., 0], -llff[..., 2]], axis=-1)
+    poses = matrices(llff[..., 3], Rotation.from_matrix(turns).as_quat())
+    times, none = (views[:, :1] + 25_001_000 * np.arange(5)).ravel(), np.zeros(0, np.int64)
+    return Plain(np.concatenate(events), times, poses, none, none, starts_at_zero=False)
+
+
 def plain_own(folder: Path) -> Plain:
     events = np.column_stack([np.load(folder / f"events/{name}.npy").astype(np.int64) for name in "xytp"])
     stamps = stamps_in(folder, "frames/stamps_ns.txt", "ns")
@@ -399,6 +494,15 @@ LAYOUTS = {
     "evimo2_left_camera": Layout("evimo2", test_evimo2.write_evimo2, plain_evimo2, ("dataset_depth.npz",)),
     "mvsec": Layout("mvsec", test_mvsec.write_mvsec, plain_mvsec),
     "vector": Layout("vector", test_vector.write_vector, plain_vector),
+    **{
+        f"ros_bag_{ros}": Layout(
+            "ros_bag", partial(write_ros_bag, ros=ros), partial(plain_ros_bag, ros=ros), ("metadata.yaml",)
+        )
+        for ros in (1, 2)
+    },
+    "m3ed": Layout("m3ed", write_m3ed, plain_m3ed),
+    "dsec": Layout("dsec", write_dsec, plain_dsec, ("timestamps.txt", "exposure_timestamps.txt", "rectify_map.h5")),
+    "e2nerf": Layout("e2nerf", write_e2nerf, plain_e2nerf, lists_images=True),
     "event_recording": Layout("event_recording", write_own, plain_own),
 }
 
@@ -419,7 +523,9 @@ WITH_CHECKSUMS = (".npz", ".png")
 
 KINDS_OF_TABLES = {
     "poses": ("*groundtruth*", "*poses*", "mocap_data.txt", "*.gt.txt"),
-    "stamps": ("image_stamps*", "image*_timestamps*", "stamps_ns.txt", "images.txt", "timestamp.txt"),
+    "stamps": (
+        *("image_stamps*", "image*_timestamps*", "timestamps.txt", "stamps_ns.txt", "images.txt", "timestamp.txt"),
+    ),
     "events": ("events.txt",),
     "exposures": ("image_exposures*",),
     "others": ("*",),
@@ -439,7 +545,7 @@ LISTS_OF_ANY_LENGTH = ("frames", "distortion", "data")
 WITH_FLOATS = ("eventnerf", "llff_events")
 """Formats whose columns of events may be floats."""
 OF_ANY_UNIT = "t of any unit"
-TIMES, SECONDS_OF_EVENTS = ("t", "timestamp", "T_wc_timestamp", OF_ANY_UNIT), ("dataset_events_t",)
+TIMES, SECONDS_OF_EVENTS = ("t", "ts", "timestamp", "T_wc_timestamp", OF_ANY_UNIT), ("dataset_events_t",)
 COORDINATES, POLARITIES = ("x", "y", "position", "dataset_events_xy"), ("p", "polarity", "dataset_events_p")
 NOT_READ = ("index", "discretization")
 ARRAYS_OF_ANY_LENGTH = ("rows", "poses_bounds", "distortion_params")
@@ -575,7 +681,7 @@ def damage_value(draw: Draw, tree: Any) -> Outcome:
         inside = inside[step]
     kind = draw(st.sampled_from(["no value", "odd value", "null", "removed", "doubled"]))
     note(f"{[*above, key]}: {kind}")
-    outcome: Outcome = "refused or the same"
+    outcome: Outcome = "refused or plain" if above[-1:] == ["topic_metadata"] else "refused or the same"
     if kind == "no value":
         inside[key] = draw(st.sampled_from(NO_VALUES))
     elif kind == "odd value":
@@ -690,8 +796,9 @@ def damage_arrays(draw: Draw, layout: Layout, path: Path) -> Outcome:
     with h5py.File(path, "r+") as file:
         if "davis/left" in file:
             return damage_mvsec(draw, file["davis/left"])
-        group: Any = file["events"] if "events" in file else file
-        name = draw(st.sampled_from([name for name in ("x", "y", "t", "p", "rectify_map") if name in group]))
+        group: Any = next((file[name] for name in ("events", "prophesee/left") if name in file), file)
+        names = ("x", "y", "t", "p", "rectify_map", "ts", "Cn_T_C0")
+        name = draw(st.sampled_from([name for name in names if name in group]))
         kind = draw(st.sampled_from(["removed", *["exchanged"] * (name in "xy"), *["changed"] * 8]))
         note(f"{name}: {kind}")
         if kind == "exchanged":
@@ -791,7 +898,11 @@ def facts(recording: EventRecording) -> dict[str, Any]:
     def of_frames(frames: Frames | None) -> tuple | None:
         if frames is None:
             return None
-        names = [str(file.relative_to(recording.path)) for file in frames.filenames]
+        inside = [recording.path in file.parents for file in frames.filenames]  # others are kept in the cache
+        names = [
+            str(file.relative_to(recording.path)) if of_folder else file.name
+            for file, of_folder in zip(frames.filenames, inside, strict=True)
+        ]
         pictures = [load_picture(file) for file in frames.filenames]
         depth = [load_array(file) for file in frames.depth_filenames or ()]
         return names, frames.times, frames.numbers, frames.camera, of_trajectory(frames.trajectory), pictures, depth

@@ -353,7 +353,7 @@ def lines_file(folder: Path) -> Path:
 
 
 def test_other_formats_keep_their_poses(tmp_path: Path):
-    with pytest.raises(FlagError, match=r"for event files and recordings of davis, event_recording, but .* as esim"):
+    with pytest.raises(FlagError, match=r"for event files and recordings of davis, .*, but .* as esim"):
         read_recording(write_esim(tmp_path / "esim"), poses=GivenPoses(lines_file(tmp_path)))
 
 

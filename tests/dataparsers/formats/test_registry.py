@@ -80,7 +80,7 @@ def test_read_folder_finds_the_format_and_reads_a_folder_once(tmp_path: Path, mo
 def test_the_formats_of_the_package():
     assert [format.name for format in formats()] == [
         *("esim", "esim_npz", "esim_bag", "davis", "eds", "tum_vie", "eventnerf", "llff_events", "evimo2", "mvsec"),
-        *("vector", "event_recording"),
+        *("vector", "ros_bag", "m3ed", "dsec", "e2nerf", "event_recording"),
     ]
     assert layouts() == ("esim", "eds", "tum_vie", "event_recording")
     for format in formats():
@@ -127,7 +127,7 @@ def test_options_that_the_format_lacks(basket: Path, tmp_path: Path):
     esim = write_esim(tmp_path / "esim")
     with pytest.raises(FlagError, match=r"^--basket is for recordings of basket, but .*esim is read as esim; leave it"):
         read_recording(esim, basket="red")
-    with pytest.raises(FlagError, match=r"^--event-camera is for recordings of .*evimo2 and basket, but .* as esim"):
+    with pytest.raises(FlagError, match=r"^--event-camera is for recordings of tum_vie.* and basket, but .* as esim"):
         read_recording(esim, "esim", event_camera="left")
     with pytest.raises(FlagError, match=r"^--lid-open is no option of any format, but .* is read as basket"):
         read_recording(basket, lid_open=True)
