@@ -45,7 +45,7 @@ def test_scores_of_a_view_are_of_the_aligned_render_but_the_correlation_of_the_r
     aligned = align([view.rendered for view in made], recorded, DEFAULT_PROTOCOL)
     for scores_, view, picture, truth in zip(scored(made), made, aligned.rendered, recorded, strict=True):
         clipped, recorded_depth = picture.clamp(0.0, 1.0), view.recorded_depth
-        assert recorded_depth is not None and (clipped != picture).any()
+        assert view.depth is not None and recorded_depth is not None and (clipped != picture).any()
         assert scores_ == {
             "psnr": psnr(clipped, truth),
             "ssim": ssim(clipped, truth),
@@ -130,6 +130,7 @@ def test_means_are_over_the_frames_that_have_a_score_and_the_others_are_named():
     faulty[1].recorded_depth[:] = 0.0
     faulty[4].recorded_depth[:] = torch.nan
     faulty[2].rendered[0, 0] = torch.nan
+    assert faulty[3].depth is not None
     faulty[3].depth[5, 5] = torch.inf
     table = summary_scores(faulty, {"fps": 2.0})
     assert table.pop("not_scored") == {

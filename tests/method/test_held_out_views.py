@@ -69,6 +69,7 @@ def test_a_view_is_reduced_to_means_over_squares_seen_from_their_middles(run: Ru
     blocks = whole.recorded.numpy()[:20, :30].reshape(4, 5, 6, 5, 3)
     np.testing.assert_allclose(reduced.recorded.numpy(), blocks.mean(axis=(1, 3)), atol=1e-6)
     np.testing.assert_allclose(reduced.rendered, whole.rendered[2:20:5, 2:30:5], atol=1e-4)
+    assert reduced.depth is not None and whole.depth is not None
     np.testing.assert_allclose(reduced.depth, whole.depth[2:20:5, 2:30:5], rtol=1e-3)
     files = run.pipeline.datamanager.eval_dataset.frames.depth_filenames
     assert files is not None

@@ -79,6 +79,7 @@ def test_the_error_is_render_less_frame_and_both_depths_have_one_scale(run: Run)
 
 def test_depth_that_is_not_known_is_pale(run: Run):
     view = shown(run)[0]
+    assert view.depth is not None
     confidence = torch.linspace(0.0, 1.0, view.depth.numel()).view(view.depth.shape)
     figure = figure_of([replace(view, confidence=confidence)], run.pipeline.datamanager.eval_dataset.recording)
     (depth,) = [axis.images[0] for axis in figure.axes if axis.get_title() == "rendered depth"]

@@ -319,6 +319,7 @@ def test_a_run_of_this_package_is_rendered_as_its_own_evaluation_does(tmp_path: 
     for view in views:
         time = view.time - recording.trajectory.start
         np.testing.assert_allclose(run.brightness(time), view.rendered[..., 0].numpy(), atol=1e-4)
+        assert view.depth is not None
         np.testing.assert_allclose(run.depth(time), view.depth[..., 0].numpy(), rtol=1e-3)
 
     time = views[0].time - recording.trajectory.start

@@ -134,7 +134,11 @@ def test_an_exposure_longer_than_its_poses_is_cut(tmp_path: Path):
 
 
 def without(*names: str) -> Callable[[Path], None]:
-    return lambda folder: [(folder / name).unlink() for name in names] and None
+    def removed(folder: Path) -> None:
+        for name in names:
+            (folder / name).unlink()
+
+    return removed
 
 
 def one_more_pose(folder: Path) -> None:

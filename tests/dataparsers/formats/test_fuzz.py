@@ -393,7 +393,8 @@ def plain_m3ed(folder: Path) -> Plain:
         columns = [file[f"prophesee/left/{name}"][...].astype(np.int64) for name in "xytp"]  # type: ignore[index]
         stamps = file["ovc/ts"][...].astype(np.int64) * 1000  # type: ignore[index]
     with h5py.File(folder / "seq_pose_gt.h5") as file:
-        times, poses = file["ts"][...].astype(np.int64), np.linalg.inv(file["Cn_T_C0"][...])  # type: ignore[index]
+        times, moved = np.asarray(file["ts"], np.int64), np.asarray(file["Cn_T_C0"])
+        poses = np.linalg.inv(moved)
         poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()  # the closest rotations
     return Plain(np.stack(columns, axis=1) * [1, 1, 1000, 1], times * 1000, poses, stamps, stamps)
 

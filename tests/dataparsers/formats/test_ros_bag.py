@@ -28,6 +28,7 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.recording import Frames
 
 typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is an optional extra of the project")
 
@@ -453,15 +454,21 @@ def test_a_colour_filter_is_undone(tmp_path: Path):
     assert pixels.shape == (4, 4, 3) and (pixels == [200, 100, 50]).all()
 
 
+def frames_of(folder: Path) -> Frames:
+    frames = ros_bag.read(folder).frames
+    assert frames is not None
+    return frames
+
+
 def test_frames_are_kept_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = write_bag(tmp_path / "bag")
-    first = ros_bag.read(folder).frames
+    first = frames_of(folder)
     states = [file.stat().st_mtime_ns for file in first.filenames]
-    again = ros_bag.read(folder).frames
+    again = frames_of(folder)
     assert again.filenames == first.filenames
     assert [file.stat().st_mtime_ns for file in again.filenames] == states
     os.utime(folder / "recording.bag", ns=(5, 5))
-    assert ros_bag.read(folder).frames.filenames[0].parent != first.filenames[0].parent
+    assert frames_of(folder).filenames[0].parent != first.filenames[0].parent
     monkeypatch.setenv("ENERF_CACHE", str(folder / "recording.bag"))
     with pytest.raises(OutputError, match=r"^The frames of .*recording\.bag cannot be written to the cache \("):
         ros_bag.read(folder)
@@ -480,7 +487,7 @@ def test_topics_are_chosen(tmp_path: Path):
         ros_bag.read(folder, bag_events="/none")
     with pytest.raises(FlagError, match=r"2 topics with poses; give --bag-poses as one of /odometry and /pose\."):
         ros_bag.read(folder, bag_events="/dvs/events")
-    chosen = {"bag_events": "/right/events", "bag_poses": "/odometry"}
+    chosen: dict[str, Any] = {"bag_events": "/right/events", "bag_poses": "/odometry"}
     recording = ros_bag.read(folder, **chosen)
     assert recording.frames is None
     assert "several topics of them; give --bag-frames as one of /a/image_raw, /b/image_raw." in recording.notes[0]
