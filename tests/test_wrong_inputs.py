@@ -124,13 +124,11 @@ FILES: dict[str, tuple[str, ...]] = {
     ),
     "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5"),
     "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
-    "ros_bag_1": ("recording.bag",),
     "ros_bag_2": ("bag.db3",),
     "dsec": (
         "events/left/events.h5",
         "calibration/cam_to_cam.yaml",
         "poses.txt",
-        "images/left/exposure_timestamps.txt",
     ),
     "m3ed": ("seq_data.h5", "seq_pose_gt.h5"),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
@@ -143,10 +141,15 @@ OPTIONAL: dict[str, tuple[str, ...]] = {
     "eds_prepared": ("rectify_map_calib0.h5",),
     "tum_vie_prepared": ("calibration.json", "rectify_map_left.h5"),
     "esim": ("simulation.json", "0_poses_all.txt"),
+    "ros_bag_1": ("recording.bag",),  # without which nothing is in the folder
     "dsec": ("events/left/rectify_map.h5", "images/left/exposure_timestamps.txt"),
     "esim_npz": ("views/transforms_test.json",),
 }
 """Files that may be missing, or whose lack a table of the layout has, but that must be sound where they are there."""
+
+
+FOUND_BY_THEIR_END = ("mvsec", "m3ed")
+"""Layouts whose files begin with the name of the sequence, which a missing one does not tell."""
 
 
 def cases_of_files() -> dict[str, Wrong]:
@@ -154,7 +157,7 @@ def cases_of_files() -> dict[str, Wrong]:
     for files, kinds in ((FILES, list(ANYTHING)), (OPTIONAL, list(ANYTHING)[2:])):
         for whole, names in files.items():
             for name in map(Path, names):
-                said = name.parent.name or name.name.rpartition("-")[2]
+                said = name.parent.name or name.name.rpartition("_" if whole in FOUND_BY_THEIR_END else "-")[2]
                 for kind in kinds:
                     cases[f"{whole}: {name} {kind}"] = Wrong(whole, _at(name, ANYTHING[kind]), (said,), "convert")
     return cases

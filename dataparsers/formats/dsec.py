@@ -24,6 +24,7 @@ Gehrig et al., "DSEC: A stereo event camera dataset for driving scenarios", RA-L
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -233,7 +234,13 @@ def _read_frames(
 
 
 def _optional(folder: Path, patterns: tuple[str, ...]) -> Path | None:
-    return next((file for pattern in patterns for file in sorted(folder.glob(pattern))), None)
+    """Returns the first file that is there, if only as a link that leads nowhere, which reading refuses."""
+    for pattern in patterns:
+        if os.path.lexists(folder / pattern):
+            return folder / pattern
+        for file in sorted(folder.glob(pattern)):
+            return file
+    return None
 
 
 FORMAT = Format(
