@@ -123,6 +123,7 @@ FILES: dict[str, tuple[str, ...]] = {
         "images_1/01.png",
     ),
     "mvsec": ("indoor_flying1_data.hdf5", "indoor_flying1_gt.hdf5"),
+    "evimo2_left_camera": ("dataset_events_t.npy", "dataset_events_xy.npy", "dataset_info.npz"),
     "vector": ("desk_normal1.synced.gt.txt", "desk_normal1.synced.left_camera/timestamp.txt", test_vector.BODY),
     "ros_bag_2": ("bag.db3",),
     "dsec": (
@@ -294,7 +295,7 @@ def output_of(command: str) -> tuple[str, str]:
 @pytest.mark.parametrize("name", CASES)
 def test_a_wrong_input_is_refused_in_one_sentence(name, whole, refused, tmp_path, monkeypatch):
     wrong = CASES[name]
-    recording = shutil.copytree(whole(wrong.whole), tmp_path / "recording")
+    recording = shutil.copytree(whole(wrong.whole), tmp_path / wrong.whole.replace(" ", "-") / "recording")
     wrong.fault(recording)
     monkeypatch.chdir(tmp_path)
     before = tree(tmp_path)
@@ -514,7 +515,7 @@ def child(*command: str, **options: Any) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(("program", "name"), CHILDREN)
 def test_a_wrong_input_is_refused_by_the_command_itself(program, name, whole, tmp_path):
     wrong = CASES[name]
-    recording = shutil.copytree(whole(wrong.whole), tmp_path / "recording")
+    recording = shutil.copytree(whole(wrong.whole), tmp_path / wrong.whole.replace(" ", "-") / "recording")
     wrong.fault(recording)
     source = recording / "recording.raw" if wrong.whole == "file" else recording
     before = tree(tmp_path)
@@ -591,4 +592,4 @@ def test_nor_is_the_cache(home: Path, refused, monkeypatch: pytest.MonkeyPatch):
 
 def test_the_corpus_is_large():
     assert len(CASES) + len(place_cases()) + len(FLAGS) + 3 * len(INTO) >= 300
-    assert {wrong.whole for wrong in CASES.values()} == set(WHOLE)
+    assert {wrong.whole for wrong in CASES.values()} == set(WHOLE) - {"e2nerf"}  # whose table is in a test of its own

@@ -214,12 +214,16 @@ def _files_found(path: Path) -> dict[Format, int]:
 
 
 def _find_format(path: Path) -> Format:
-    """Returns the format with the most files in a folder. Exact names count a little more than patterns."""
-    found = {
-        format: count + 0.1 * sum((path / name).exists() for name in format.files)
-        for format, count in _files_found(path).items()
-    }
+    """Returns the format with the most files in a folder.
+
+    A format does not count beside one that names all its files exactly: esim.bag is no bag of any driver.
+    """
+    found = _files_found(path)
     best = [format for format, count in found.items() if count == max(found.values())]
+    if len(best) > 1 and found[best[0]]:
+        files = {format: {file for pattern in format.files for file in path.glob(pattern)} for format in best}
+        named = {format: {path / name for name in format.files if (path / name).exists()} for format in best}
+        best = [one for one in best if not any(files[one] <= named[other] for other in best if other is not one)]
     if len(best) == 1:
         return best[0]
     looked_for = "; ".join(f"for {format.name}: {', '.join(format.files)}" for format in formats())

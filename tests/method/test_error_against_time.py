@@ -57,7 +57,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     """A step takes one second, scoring a frame half of one, and nothing else any time."""
     clock = Clock()
     for module in (error_against_time, stopwatch):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+        monkeypatch.setattr(
+            module, "time", SimpleNamespace(perf_counter=clock.perf_counter, process_time=clock.perf_counter)
+        )
     monkeypatch.setattr(Trainer, "train_iteration", clock.takes(1.0, Trainer.train_iteration))
     monkeypatch.setattr(evaluation_scores, "view_scores", clock.takes(0.5, evaluation_scores.view_scores))
     monkeypatch.setattr(error_against_time, "PAIRS", 64)  # so that moments fit into so few steps

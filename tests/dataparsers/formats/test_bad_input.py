@@ -17,7 +17,8 @@ from recordings import HEIGHT, WIDTH, write_davis, write_esim, write_image
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import load_array, load_image
+from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.hdf5_files import load_depth_map, load_picture
 
 
 @dataclass
@@ -357,9 +358,9 @@ def read_all(folder: Path, format: str) -> None:
     len(index_events(recording).events())
     for frames in (recording.frames, recording.blurred_frames):
         for file in frames.filenames if frames else ():
-            load_image(file)
+            load_picture(file)
         for file in frames.depth_filenames or () if frames else ():
-            load_array(file)
+            load_depth_map(file)
 
 
 def is_one_sentence(message: str) -> bool:
