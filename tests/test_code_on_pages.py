@@ -212,8 +212,9 @@ def strings_of_the_package() -> Iterator[str]:
 # --------------------------------------------------------------------------------------------------- examples in Python
 
 PYTHON = [(page, number) for page in PAGES for number in range(len(blocks(page, "python")))]
-ELSEWHERE = {"hash-grid.md", "notebook.md"}
-"""Pages whose examples other tests run: `tests/kernels/test_fast_hash_encoding.py`, and the test of the notebook."""
+ELSEWHERE = {"hash-grid.md", "notebook.md", "tutorial-pictures.md"}
+"""Pages whose examples are not run here: others do so (`tests/kernels/test_fast_hash_encoding.py`, the test of the
+notebook), or they need the recording of a command above them."""
 
 
 @pytest.mark.parametrize(("page", "number"), PYTHON, ids=lambda value: getattr(value, "name", str(value)))

@@ -29,6 +29,7 @@ MODULES = sorted(
     ".".join([package, *file.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__")
     for package, folder in PACKAGES.items()
     for file in folder.rglob("*.py")
+    if file.parts[-2:] != ("nerfbaselines", "spec.py")  # which nerfbaselines alone imports
 )
 WITHOUT_NERFSTUDIO = [
     module

@@ -63,7 +63,7 @@ def test_what_another_command_wrote_meanwhile_stays(tmp_path: Path):
 
 def test_options_that_the_format_lacks_and_folders_within(tmp_path: Path):
     source = write_esim(tmp_path / "esim")
-    with pytest.raises(FlagError, match="--event-camera is for recordings of tum_vie and evimo2"):
+    with pytest.raises(FlagError, match="--event-camera is for recordings of tum_vie, evimo2, "):
         convert_recording(source, tmp_path / "new", event_camera="right")
     with pytest.raises(OutputError, match="lies within the recording"):
         convert_recording(source, source / "new")
