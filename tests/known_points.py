@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
+import torch
+from recordings import joined
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
+
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 
 SPOT_SIZE = 1.5
 """Standard deviation of a spot, pixels."""
@@ -72,3 +78,22 @@ def spot_centre(image: np.ndarray, near: np.ndarray) -> np.ndarray:
     weights = grey[rows, columns].astype(float)
     assert weights.max() > 100, f"there is no spot near {near}"
     return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+
+
+def check_events_see(recording: EventRecording, points: np.ndarray) -> None:
+    """Checks that each event of a recording lies in the direction of its point [events, 3], within 0.01 pixel."""
+    found = joined(recording.stream_events())
+    camera_to_world = recording.trajectory.poses(torch.from_numpy(found.t)).numpy()
+    seen = np.einsum("nji,nj->ni", camera_to_world[:, :, :3], points - camera_to_world[:, :, 3])
+    directions = recording.camera.pixel_directions()[found.y, found.x]
+    error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - directions[:, :2], axis=1) * recording.camera.fx
+    assert error.max() < 0.01
+
+
+def check_pictures_show(frames: Frames, spots: Sequence[np.ndarray]) -> None:
+    """Checks that each undistorted picture shows its points [points, 3] as spots in their place, within 0.15 pixel."""
+    poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
+    for number, points in enumerate(spots):
+        whole = np.vstack([poses[number], [0, 0, 0, 1]])[None].repeat(len(points), 0)
+        for place in project(points, whole, frames.picture_camera.matrix):
+            assert np.linalg.norm(spot_centre(frames.picture(number), place) - place) < 0.15

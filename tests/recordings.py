@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
@@ -32,6 +33,17 @@ POSE_TIMES = np.arange(11) * 100_000_000
 FRAME_TIMES = np.array([150_000_000, 450_000_000, 750_000_000])
 
 
+TRUE_EVENTS = np.column_stack(
+    [
+        np.random.default_rng(3).integers(0, WIDTH, 2000),
+        np.random.default_rng(4).integers(0, HEIGHT, 2000),
+        np.sort(np.random.default_rng(5).integers(1000, 999_000, 2000)) * 1000,
+        np.random.default_rng(6).integers(0, 2, 2000),
+    ]
+)
+"""Many events x y t (ns, whole microseconds) p (0 or 1), over the poses."""
+
+
 def joined(pieces: Iterable[Events]) -> Events:
     """The events of a stream as one array a column."""
     held = list(pieces)
@@ -43,6 +55,14 @@ def poses() -> np.ndarray:
     angles = np.linspace(0.0, 0.5, len(POSE_TIMES)) / 2
     zero = np.zeros_like(angles)
     return np.column_stack([np.linspace(0, 1, len(angles)), zero, zero, zero, np.sin(angles), zero, np.cos(angles)])
+
+
+def check_poses(trajectory: Trajectory, expected: np.ndarray) -> None:
+    """Compares poses at `POSE_TIMES` with matrices, float64 [11, 4, 4]."""
+    np.testing.assert_array_equal(trajectory.times, POSE_TIMES)
+    np.testing.assert_allclose(trajectory.positions, expected[:, :3, 3], atol=1e-12)
+    found = Rotation.from_quat(trajectory.quaternions).as_matrix()
+    np.testing.assert_allclose(found, expected[:, :3, :3], atol=1e-12)
 
 
 def image(index: int, channels: int = 1) -> np.ndarray:

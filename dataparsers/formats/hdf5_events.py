@@ -15,15 +15,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from enerf_ns.dataparsers.formats.columns import check_columns, check_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import LARGEST_ARRAY, of_file, reading, write_all
-from enerf_ns.dataparsers.recording.hdf5_files import check_filters, member
+from enerf_ns.dataparsers.recording.files import of_file, reading, write_all
+from enerf_ns.dataparsers.recording.hdf5_files import check_filters, member, member_at, open_hdf5
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, Events
 from enerf_ns.dataparsers.recording.time_units import NANOSECONDS, Times
 
@@ -194,69 +194,6 @@ def read_rectified_camera(path: Path, undistorted: Camera) -> Camera:
     directions = (rectify_map.astype(np.float64) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     with of_file(path):
         return replace(undistorted, model="lookup", directions=directions)
-
-
-def open_hdf5(path: Path, **options: Any) -> h5py.File:
-    """Returns an HDF5 file that is open for reading, with the filters of hdf5plugin; options are those of h5py."""
-    import h5py
-    import hdf5plugin  # noqa: F401  makes the filters known
-
-    return h5py.File(path, "r", locking=False, **options)
-
-
-def member_at(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
-    """Returns the member with this name, which has / between its parts, or None. It raises what `member` raises."""
-    import h5py
-
-    *above, last = name.split("/")
-    for part in above:
-        inner = member(path, group, part)
-        if not isinstance(inner, h5py.Group):
-            return None
-        group = inner
-    return member(path, group, last)
-
-
-def read_dataset(path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Returns a dataset of real numbers that is read as a whole.
-
-    Args:
-        path: The file, for error messages.
-        file: The same, opened.
-        name: Name of the dataset, with / between its parts.
-        expected: The expected content, such as "poses, 4 x 4 numbers each".
-        shape: Its shape, with None for a length that is free.
-
-    Raises:
-        RecordingError: It is missing, has another shape or type, is larger than `LARGEST_ARRAY`, or cannot be read.
-    """
-    dataset = dataset_at(path, file, name, expected, shape)
-    if dataset.size * dataset.dtype.itemsize > LARGEST_ARRAY:
-        raise RecordingError(
-            f"{path} holds {name} of {dataset.size:,} numbers, but {expected} of at most {LARGEST_ARRAY:,} bytes was "
-            "expected; give a part of it."
-        )
-    return np.asarray(dataset[...])
-
-
-def dataset_at(path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...]) -> h5py.Dataset:
-    """Returns a dataset of real numbers, of which only the header is read, as `read_dataset` does."""
-    import h5py
-
-    dataset = member_at(path, file, name)
-    if not isinstance(dataset, h5py.Dataset):
-        raise RecordingError(f"{path} lacks the dataset {name}, {expected}; get the file as it is published.")
-    fits = len(dataset.shape) == len(shape) and all(
-        want in (None, length) for want, length in zip(shape, dataset.shape, strict=True)
-    )
-    if not fits or dataset.dtype.kind not in "iuf":
-        wanted = " x ".join("n" if length is None else str(length) for length in shape) or "one number"
-        raise RecordingError(
-            f"{path} holds {name} as {dataset.dtype} of shape {dataset.shape}, but numbers of shape {wanted} were "
-            f"expected: {expected}."
-        )
-    check_filters(path, dataset)
-    return dataset
 
 
 def _chunk_bytes(dataset: h5py.Dataset) -> int:

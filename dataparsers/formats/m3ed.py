@@ -32,12 +32,13 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.columns import check_times
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
-from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, dataset_at, member_at, open_hdf5, read_dataset
+from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
 from enerf_ns.dataparsers.formats.kept_frames import keep_frames
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseRows
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
 from enerf_ns.dataparsers.recording.files import of_file, reading
+from enerf_ns.dataparsers.recording.hdf5_files import dataset_at, member_at, open_hdf5, read_dataset
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 

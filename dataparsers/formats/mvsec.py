@@ -45,7 +45,7 @@ from enerf_ns.dataparsers.formats.yaml_values import find_calibration, kalibr_ca
 from enerf_ns.dataparsers.recording.camera import ROTATION_TOLERANCE, Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import reading
-from enerf_ns.dataparsers.recording.hdf5_files import dataset_in, member
+from enerf_ns.dataparsers.recording.hdf5_files import dataset_at, member, open_hdf5
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -124,26 +124,11 @@ def _find_one(folder: Path, pattern: str) -> Path:
     return found[0]
 
 
-def _open(path: Path) -> h5py.File:
-    import h5py
-    import hdf5plugin  # noqa: F401  makes the filters known
-
-    return h5py.File(path, "r", locking=False)
-
-
 def _numbers(
     path: Path, file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...], expected: str
 ) -> h5py.Dataset:
     """Returns a dataset of the camera, of these kinds of numbers and this shape, with None for any length."""
-    dataset = dataset_in(path, file, f"{CAMERA}/{name}")
-    fits = len(dataset.shape) == len(shape) and all(
-        size in (None, found) for size, found in zip(shape, dataset.shape, strict=True)
-    )
-    if dataset.dtype.kind not in kinds or not fits:
-        raise RecordingError(
-            f"{path} holds {CAMERA}/{name} as {dataset.dtype} of shape {dataset.shape}, but {expected} were expected."
-        )
-    return dataset
+    return dataset_at(path, file, f"{CAMERA}/{name}", expected, shape, kinds)
 
 
 def _nanoseconds(path: Path, name: str, seconds: np.ndarray, start: int = 0) -> Int64[np.ndarray, " times"]:
@@ -184,7 +169,7 @@ def _stamps(path: Path, file: h5py.File, name: str) -> Int64[np.ndarray, " stamp
 
 def _open_events(path: Path) -> tuple[int, int]:
     """Returns the number of events and the time (ns) of the first."""
-    with reading(path, "an HDF5 file of MVSEC"), _open(path) as file:
+    with reading(path, "an HDF5 file of MVSEC"), open_hdf5(path) as file:
         events = _events(path, file)
         if not len(events):
             raise RecordingError(f"{path} holds no events; give a recording with some.")
@@ -197,7 +182,7 @@ def _events(path: Path, file: h5py.File) -> h5py.Dataset:
 
 def _stream_events(path: Path, num_events: int, zero: int) -> Iterator[Events]:
     with reading(path, "an HDF5 file of MVSEC"):
-        file = _open(path)
+        file = open_hdf5(path)
     with file:
         for start in range(0, num_events, EVENTS_AT_A_TIME):
             stop = min(start + EVENTS_AT_A_TIME, num_events)
@@ -222,7 +207,7 @@ def _read_poses(
     path: Path,
 ) -> tuple[Int64[np.ndarray, " poses"], Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"]]:
     """Returns times (ns), positions (metres) and quaternions xyzw."""
-    with reading(path, "an HDF5 file of MVSEC"), _open(path) as file:
+    with reading(path, "an HDF5 file of MVSEC"), open_hdf5(path) as file:
         times = _stamps(path, file, "pose")
         dataset = _numbers(path, file, "pose", "f", (None, 4, 4), "matrices of 4 x 4 numbers")
         if len(dataset) != len(times) or len(times) < 2:
@@ -251,7 +236,7 @@ Pictures = tuple[Int64[np.ndarray, " pictures"], tuple[Path, ...]]
 def _pictures(path: Path, name: str, camera: Camera) -> Pictures | None:
     """Returns times and paths of frames or depth maps; None if the file holds none."""
     is_depth = name.startswith("depth")
-    with reading(path, "an HDF5 file of MVSEC"), _open(path) as file:
+    with reading(path, "an HDF5 file of MVSEC"), open_hdf5(path) as file:
         group: Any = file
         for part in CAMERA.split("/"):
             group = member(path, group, part)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -88,11 +88,8 @@ def _load(path: Path) -> np.ndarray:
     with reading(source, "a file with pictures"):
         if source.suffix == ".npz":
             return _load_from_npz(source, last)
-        import h5py
-        import hdf5plugin  # noqa: F401  makes the filters known
-
-        with h5py.File(source, "r", locking=False) as file:
-            dataset = dataset_in(source, file, "/".join(names))
+        with open_hdf5(source) as file:
+            dataset = dataset_in(source, file, "/".join(names), "pictures")
             _checked(source, dataset.dtype, dataset.shape[1:])
             return dataset[int(last)]
 
@@ -118,24 +115,85 @@ def _checked(source: Path, kind: np.dtype, shape: tuple[int, ...]) -> None:
         )
 
 
-def dataset_in(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Returns a dataset of a file.
+def open_hdf5(path: Path, **options: Any) -> h5py.File:
+    """Returns an HDF5 file that is open for reading, with the filters of hdf5plugin; options are those of h5py."""
+    import h5py
+    import hdf5plugin  # noqa: F401  makes the filters known
+
+    return h5py.File(path, "r", locking=False, **options)
+
+
+def member_at(path: Path, group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | h5py.Datatype | None:
+    """Returns the member with this name, which has / between its parts, or None. It raises what `member` raises."""
+    import h5py
+
+    *above, last = name.split("/")
+    for part in above:
+        inner = member(path, group, part)
+        if not isinstance(inner, h5py.Group):
+            return None
+        group = inner
+    return member(path, group, last)
+
+
+def read_dataset(path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Returns a dataset of real numbers that is read as a whole.
 
     Args:
-        path: The file.
-        file: The open file.
-        name: Names of groups and dataset, separated by slashes.
+        path: The file, for error messages.
+        file: The same, opened.
+        name: Name of the dataset, with / between its parts.
+        expected: The expected content, such as "poses, 4 x 4 numbers each".
+        shape: Its shape, with None for a length that is free.
+
+    Raises:
+        RecordingError: It is missing, has another shape or type, is larger than `LARGEST_ARRAY`, or cannot be read.
+    """
+    dataset = dataset_at(path, file, name, expected, shape)
+    if dataset.size * dataset.dtype.itemsize > LARGEST_ARRAY:
+        raise RecordingError(
+            f"{path} holds {name} of {dataset.size:,} numbers, but {expected} of at most {LARGEST_ARRAY:,} bytes was "
+            "expected; give a part of it."
+        )
+    return np.asarray(dataset[...])
+
+
+def dataset_at(
+    path: Path, file: h5py.File, name: str, expected: str, shape: tuple[int | None, ...], kinds: str = "iuf"
+) -> h5py.Dataset:
+    """Returns a dataset of numbers, of which only the header is read.
+
+    Args:
+        path, file, name, expected, shape: The arguments of `read_dataset`.
+        kinds: Kinds of numbers that it may hold, as NumPy's `dtype.kind`.
+
+    Raises:
+        RecordingError: It is missing, has another shape or kind, or cannot be read without harm.
+    """
+    dataset = dataset_in(path, file, name, expected)
+    fits = len(dataset.shape) == len(shape) and all(
+        want in (None, length) for want, length in zip(shape, dataset.shape, strict=True)
+    )
+    if not fits or dataset.dtype.kind not in kinds:
+        wanted = " x ".join("n" if length is None else str(length) for length in shape) or "one number"
+        raise RecordingError(
+            f"{path} holds {name} as {dataset.dtype} of shape {dataset.shape}, but numbers of shape {wanted} were "
+            f"expected: {expected}."
+        )
+    return dataset
+
+
+def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
+    """Returns a dataset of a file, of any shape and kind; the arguments are those of `read_dataset`.
 
     Raises:
         RecordingError: There is none, it refers to another place, or it cannot be read without harm.
     """
     import h5py
 
-    found = file
-    for part in name.split("/"):
-        found = member(path, found, part) if isinstance(found, h5py.Group) else None
+    found = member_at(path, file, name)
     if not isinstance(found, h5py.Dataset):
-        raise RecordingError(f"{path} lacks the dataset {name}, which was expected; give a file that holds it.")
+        raise RecordingError(f"{path} lacks the dataset {name}, {expected}; get the file as it is published.")
     check_filters(path, found)
     return found
 

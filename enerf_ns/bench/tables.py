@@ -108,7 +108,7 @@ def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
 
 
 def seconds_of(run: dict[str, Any]) -> float:
-    """Training time of a run, s: that of the processor on a CPU, since other programs hardly change it."""
+    """Training time of a run, s: that of the processor on a CPU, which other programs change less."""
     return run["processor_seconds"] if run["device"] == "CPU" and "processor_seconds" in run else run["seconds"]
 
 

@@ -99,7 +99,7 @@ class ErrorAgainstTime:
         """Time (s) of all training steps, without evaluation, checkpoints and the viewer."""
         self.processor_seconds = 0.0
         """Time (s) of the processor in these steps since this session began, summed over its cores. Other programs on
-        the machine hardly change it."""
+        the machine change it less than `seconds`, but by half where they share caches and cores."""
         self.costs: dict[str, list[float]] = {"moments": [], "previews": []}
         """Seconds of each evaluation, by its kind."""
         self.verdict: Verdict | None = None

@@ -116,9 +116,6 @@ class Score:
         scoring = self.scoring
         views = rendered_views(folder, frames, colour_filter)
         means = summary_scores(views, {}, True, scoring.protocol, scoring.lpips, scoring.crop)
-        shown = [view.cropped(*scoring.crop) for view in views] if scoring.crop else views
-        aligned, _ = aligned_views(shown, scoring.protocol)
-        each = [view_scores(*both, scoring.protocol, scoring.lpips) for both in zip(shown, aligned, strict=True)]
         names = [name for name in SCORES if name in means]
         table = Table(
             f"{len(views)} held-out frames",
@@ -145,6 +142,9 @@ class Score:
                 f"({examples}); check their order and names."
             )
         if self.output is not None:
+            shown = [view.cropped(*scoring.crop) for view in views] if scoring.crop else views
+            aligned, _ = aligned_views(shown, scoring.protocol)
+            each = [view_scores(*both, scoring.protocol, scoring.lpips) for both in zip(shown, aligned, strict=True)]
             about = {
                 "recording": str(frames.filenames[0].parent),
                 "renders": str(folder),

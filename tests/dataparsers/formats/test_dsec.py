@@ -11,7 +11,19 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, image, joined, poses, seconds, write_image
+from recordings import (
+    FRAME_TIMES,
+    HEIGHT,
+    POSE_TIMES,
+    TRUE_EVENTS,
+    WIDTH,
+    check_poses,
+    image,
+    joined,
+    poses,
+    seconds,
+    write_image,
+)
 from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
 
@@ -24,16 +36,6 @@ from enerf_ns.dataparsers.recording.errors import RecordingError
 
 ZERO = 50_000_000_000_000
 """Time of the clock of the images at the recording's zero, ns."""
-
-TRUE_EVENTS = np.column_stack(
-    [
-        np.random.default_rng(3).integers(0, WIDTH, 2000),
-        np.random.default_rng(4).integers(0, HEIGHT, 2000),
-        np.sort(np.random.default_rng(5).integers(1000, 999_000, 2000)) * 1000,
-        np.random.default_rng(6).integers(0, 2, 2000),
-    ]
-)
-"""x y t (ns, whole microseconds) p, over the poses of `recordings`."""
 
 EXPOSURES = np.array([4_000_000, 300_000, 14_996_000])
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 8.5, (-0.1, 0.02, 0.001, -0.002), "radtan")
@@ -125,13 +127,6 @@ def test_both_sides_in_both_layouts(tmp_path: Path, side: str, number: int, unpa
     flat = np.eye(4)
     flat[:3, :3] = RECTIFYING[frame].T
     check_poses(frames.trajectory, camera_to_world() @ IN_LEFT[frame] @ flat)
-
-
-def check_poses(trajectory: Any, expected: np.ndarray) -> None:
-    np.testing.assert_array_equal(trajectory.times, POSE_TIMES)
-    np.testing.assert_allclose(trajectory.positions, expected[:, :3, 3], atol=1e-12)
-    found = Rotation.from_quat(trajectory.quaternions).as_matrix()
-    np.testing.assert_allclose(found, expected[:, :3, :3], atol=1e-12)
 
 
 def test_without_poses_the_error_says_that_there_are_none(tmp_path: Path):

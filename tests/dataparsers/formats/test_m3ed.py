@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, image, joined, poses
+from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, TRUE_EVENTS, WIDTH, check_poses, image, joined, poses
 from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
 
@@ -20,16 +20,6 @@ from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import load_image
-
-TRUE_EVENTS = np.column_stack(
-    [
-        np.random.default_rng(3).integers(0, WIDTH, 2000),
-        np.random.default_rng(4).integers(0, HEIGHT, 2000),
-        np.sort(np.random.default_rng(5).integers(1000, 999_000, 2000)) * 1000,
-        np.random.default_rng(6).integers(0, 2, 2000),
-    ]
-)
-"""x y t (ns, whole microseconds) p of the left camera, over the poses of `recordings`."""
 
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 8.5, (-0.1, 0.02, 0.001, -0.002), "radtan")
 FRAME_CAMERA = Camera(WIDTH, HEIGHT, 25.0, 25.0, 11.0, 9.0, (0.01, 0.002, 0.0, 0.001), "fisheye")
@@ -113,13 +103,6 @@ def test_the_right_camera(tmp_path: Path):
     frames = recording.frames
     assert frames is not None
     check_poses(frames.trajectory, camera_to_world() @ OVC)
-
-
-def check_poses(trajectory: Any, expected: np.ndarray) -> None:
-    np.testing.assert_array_equal(trajectory.times, POSE_TIMES)
-    np.testing.assert_allclose(trajectory.positions, expected[:, :3, 3], atol=1e-12)
-    found = Rotation.from_quat(trajectory.quaternions).as_matrix()
-    np.testing.assert_allclose(found, expected[:, :3, :3], atol=1e-12)
 
 
 def test_poses_of_the_user(tmp_path: Path):

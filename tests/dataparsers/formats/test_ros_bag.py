@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, WIDTH, image, joined, poses
+from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, TRUE_EVENTS, WIDTH, image, joined, poses
 from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
 from test_event_files import evt3
@@ -49,16 +49,6 @@ DEFINITIONS = {
         "bool is_bigendian\nuint8[] events"
     ),
 }
-
-TRUE_EVENTS = np.column_stack(
-    [
-        np.random.default_rng(3).integers(0, WIDTH, 2000),
-        np.random.default_rng(4).integers(0, HEIGHT, 2000),
-        np.sort(np.random.default_rng(5).integers(1000, 999_000, 2000)) * 1000,
-        np.random.default_rng(6).integers(0, 2, 2000),
-    ]
-)
-"""x y t (ns, whole microseconds) p, over the poses of `recordings`."""
 
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 8.5, (-0.1, 0.02, 0.001, -0.002), "radtan")
 

@@ -12,9 +12,14 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-import torch
 import yaml
-from known_points import points_seen, project, reference_poses, spot_centre, spots_image
+from known_points import (
+    check_events_see,
+    check_pictures_show,
+    points_seen,
+    reference_poses,
+    spots_image,
+)
 from recordings import joined
 from scipy.spatial.transform import Rotation
 
@@ -174,23 +179,14 @@ def test_events_are_seen_where_the_points_are(tmp_path: Path):
     poses = scene.poses(mount, scene.events[:, 2] * 1000)
     depths = np.random.default_rng(3).uniform(0.5, 5, NUM_EVENTS)
     points = points_seen(scene.events[:, :2].astype(float).copy(), depths, poses, EVENT_MATRIX, EVENT_LENS)
-    found = joined(recording.stream_events())
-    camera_to_world = recording.trajectory.poses(torch.from_numpy(found.t)).numpy()
-    seen = np.einsum("nji,nj->ni", camera_to_world[:, :, :3], points - camera_to_world[:, :, 3])
-    directions = recording.camera.pixel_directions()[found.y, found.x]
-    error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - directions[:, :2], axis=1) * recording.camera.fx
-    assert error.max() < 0.01
+    check_events_see(recording, points)
 
 
 def test_pictures_without_distortion_show_points_where_they_are(tmp_path: Path):
     scene = make_scene()
     frames = read(write_vector(tmp_path / "desk", scene)).frames
     assert frames is not None
-    poses = frames.trajectory.poses(torch.from_numpy(frames.times)).numpy()
-    for number, points in enumerate(scene.spots):
-        whole = np.vstack([poses[number], [0, 0, 0, 1]])[None].repeat(len(points), 0)
-        for place in project(points, whole, frames.picture_camera.matrix):
-            assert np.linalg.norm(spot_centre(frames.picture(number), place) - place) < 0.15
+    check_pictures_show(frames, scene.spots)
 
 
 def test_the_calibration_may_lie_beside_the_folder(tmp_path: Path):
