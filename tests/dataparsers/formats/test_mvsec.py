@@ -263,7 +263,7 @@ BAD: dict[str, tuple] = {
     "no calibration": (lambda folder: (folder / CAMCHAIN).unlink(), "holds no camchain-imucam-indoor_flying.yaml"),
     "another size": (
         lambda folder: write_camchain(folder / CAMCHAIN, resolution=[90, 72]),
-        "image_raw as uint8 of shape (3, 72, 96), but numbers of shape n x 72 x 90 were expected: pictures of 90 x 72 pixels",
+        "shape (3, 72, 96), but numbers of shape n x 72 x 90 were expected: pictures of 90 x 72 pixels",
     ),
     "no events": (in_file("data", put("events", lambda rows: rows[:0])), "holds no events"),
     "lacks events": (in_file("data", lambda group: group.pop("events")), "lacks the dataset davis/left/events"),
