@@ -16,20 +16,24 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import test_bad_input
+import test_dsec
 import test_eds
 import test_esim_npz
 import test_event_files
 import test_event_recording
 import test_eventnerf
+import test_evimo2
 import test_files
 import test_fuzz
 import test_llff_events
+import test_m3ed
 import test_mvsec
 import test_tum_vie
 import test_vector
@@ -46,12 +50,24 @@ def write_small_npz(folder: Path) -> None:
     test_esim_npz.write_views(test_esim_npz.write_npz(folder) / "views")
 
 
+HAS_AEDAT = find_spec("aedat") is not None
+"""Whether the optional extra is there that reads the recordings of E2NeRF."""
+
+
+def write_e2nerf(folder: Path) -> None:
+    import test_e2nerf  # here, since it skips where aedat is not installed
+
+    test_e2nerf.write_scene(folder)
+
+
 WHOLE: dict[str, Callable[[Path], object]] = {
     **{name: layout.write for name, layout in test_fuzz.LAYOUTS.items()},
     "small davis": write_davis,
     "small esim": lambda folder: write_esim(folder, ("images", "images_corrupted"), depth=True),
     "small own": lambda folder: test_event_recording.write_recording(folder, ("frames",), depth=True),
     "small npz": write_small_npz,
+    "e2nerf": write_e2nerf,
+    "m3ed": test_m3ed.write_m3ed,
     "file": lambda folder: (folder.mkdir(), write_event_file(folder / "recording.raw")),
 }
 """How to write each recording that a fault is put into."""
@@ -132,6 +148,7 @@ FILES: dict[str, tuple[str, ...]] = {
         "poses.txt",
     ),
     "m3ed": ("seq_data.h5", "seq_pose_gt.h5"),
+    **({"e2nerf": ("poses_bounds.npy", "images/005.jpg")} if HAS_AEDAT else {}),
     "event_recording": ("events/t.npy", "events/x.npy", "poses.txt", "recording.json", "frames/stamps_ns.txt"),
     "file": ("recording.raw",),
 }
@@ -145,6 +162,7 @@ OPTIONAL: dict[str, tuple[str, ...]] = {
     "ros_bag_1": ("recording.bag",),  # without which nothing is in the folder
     "dsec": ("events/left/rectify_map.h5", "images/left/exposure_timestamps.txt"),
     "esim_npz": ("views/transforms_test.json",),
+    **({"e2nerf": ("lego.aedat4",)} if HAS_AEDAT else {}),
 }
 """Files that may be missing, or whose lack a table of the layout has, but that must be sound where they are there."""
 
@@ -193,7 +211,16 @@ def cases_of_tables() -> dict[str, Wrong]:
         "llff_events": test_llff_events.BAD_INPUT,
         "mvsec": test_mvsec.BAD,
         "vector": test_vector.BAD,
+        "evimo2_left_camera": test_evimo2.BAD,
+        "dsec": test_dsec.BAD,
+        "m3ed": test_m3ed.BAD,
     }
+    if HAS_AEDAT:
+        import test_e2nerf
+
+        written_so, of_no_format = (name for name, (options, *_) in test_e2nerf.BAD.items() if options), "poses alone"
+        kept = test_e2nerf.BAD.keys() - {*written_so, of_no_format}
+        tables["e2nerf"] = {name: test_e2nerf.BAD[name][1:] for name in sorted(kept)}
     for whole, table in tables.items():
         for name, (fault, *said) in table.items():
             cases[f"{whole}: table: {name}"] = Wrong(whole, fault, tuple(said))
@@ -592,4 +619,4 @@ def test_nor_is_the_cache(home: Path, refused, monkeypatch: pytest.MonkeyPatch):
 
 def test_the_corpus_is_large():
     assert len(CASES) + len(place_cases()) + len(FLAGS) + 3 * len(INTO) >= 300
-    assert {wrong.whole for wrong in CASES.values()} == set(WHOLE) - {"e2nerf"}  # whose table is in a test of its own
+    assert {wrong.whole for wrong in CASES.values()} == set(WHOLE) - (set() if HAS_AEDAT else {"e2nerf"})

@@ -95,7 +95,7 @@ def read(
     rectify_map = events.path.with_name("rectify_map.h5")
     if rectify_map.exists():
         _check_map(rectify_map, calibration, side, camera)
-    files, frame_times, exposures = _read_frames(folder, side)
+    files, frame_times, exposures, stamps_file = _read_frames(folder, side)
     stamps = {file.name: time for file, time in zip(files, frame_times.tolist(), strict=True)}
     poses_file, unit = (folder / "poses.txt", "s") if poses is None else (poses.path, poses.unit)
     if poses is None and not poses_file.exists():
@@ -123,7 +123,7 @@ def read(
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,
-        times_in={"events": (events.path, "us"), "poses": (poses_file, unit), "frames": (folder / "images", "us")},
+        times_in={"events": (events.path, "us"), "poses": (poses_file, unit), "frames": (stamps_file, "us")},
     )
 
 
@@ -198,23 +198,24 @@ def _check_map(path: Path, calibration: Value, side: str, camera: Camera) -> Non
 
 def _read_frames(
     folder: Path, side: str
-) -> tuple[tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"] | None]:
-    """Returns files, middles of the exposures (ns on the clock of the images), and exposures (ns) or None."""
+) -> tuple[tuple[Path, ...], Int64[np.ndarray, " frames"], Int64[np.ndarray, " frames"] | None, Path]:
+    """Returns files, middles of the exposures (ns on the clock of the images), exposures (ns) or None, and the file of
+    the times."""
     files = images_in(folder / f"images/{side}/rectified") or images_in(folder / f"images_rectified_{side}")
     stamps_file = _optional(folder, ("images/timestamps.txt", "*image_timestamps.txt"))
     if not files:
-        return (), np.zeros(0, np.int64), None
+        return (), np.zeros(0, np.int64), None, folder
     place = files[0].parent
     stamps = None if stamps_file is None else read_stamps(files, stamps_file, "us", place)
     names = (f"images/{side}/exposure_timestamps.txt", f"images/{side}/exposure_timestamps_{side}.txt")
     exposures_file = _optional(folder, (*names, f"*image_exposure_timestamps_{side}.txt"))
     if exposures_file is None:
-        if stamps is None:
+        if stamps_file is None or stamps is None:
             raise RecordingError(
                 f"{place} holds {len(files):,} images, but their stamps are missing; add images/timestamps.txt or "
                 f"{names[0]}."
             )
-        return files, stamps, None
+        return files, stamps, None, stamps_file
     rows, numbers = read_rows(exposures_file, "start_us end_us", ",")
     check_one_each(place, len(files), exposures_file, len(rows), "exposures")
     starts = parse_times(exposures_file, [row[0] for row in rows], numbers, "us", "frames")
@@ -230,7 +231,7 @@ def _read_frames(
             f"{exposures_file} holds exposures whose middles are up to {apart.max() * 1e-6:.3g} ms from the stamps in "
             f"{stamps_file}; give both of one sequence, in µs."
         )
-    return files, middles, exposures
+    return files, middles, exposures, exposures_file
 
 
 def _optional(folder: Path, patterns: tuple[str, ...]) -> Path | None:

@@ -112,7 +112,11 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             blurred_frames=frames,
             depth_range=(near, far) if 0 < near < far < np.inf else None,
             notes=tuple(notes),
-            times_in={"events": (file.path, "us"), "poses": (poses_file, unit)},
+            times_in={
+                "events": (file.path, "us"),
+                "poses": (poses_file, unit),
+                "blurred frames": (file.path, "us"),
+            },
         )
 
 

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from PIL import Image
+from rich import get_console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_columns, check_times
@@ -206,7 +207,8 @@ def write_events(
     """
     num_events, first, last = 0, 0, -LATEST
     columns = (TextColumn("Writing {task.completed:,} events"), BarColumn(), TimeRemainingColumn())
-    with closing(_ColumnFiles(folder)) as files, Progress(*columns, transient=True) as progress:
+    shown = Progress(*columns, transient=True, disable=not get_console().is_terminal)
+    with closing(_ColumnFiles(folder)) as files, shown as progress:
         task = progress.add_task("", total=total)
         for events in filter(len, stream):
             _check_events(events, last, width, height, lambda i, before=num_events: locate(before + i))

@@ -12,6 +12,8 @@ E-3DGS has these files in place of those above:
     train/intrinsics/intrinsics.txt     4 x 4, beside radial_distortion.txt
     train/intrinsics/color_mask_undistorted.png    colour filter of the events after undistortion
     train/events/*undistort*.npz        the events that are read, if there are several files
+    train/pose_NAME/                    other poses with the names of those in train/pose, as --pose-set asks for:
+                                        perturbed, or deg=0.3_cm=2 as its tool for noise names them
     validation/rgb/000000.png ...       the picture of the view N
 
 What the files do not state is known from the loaders of both projects:
@@ -107,25 +109,30 @@ class EventNerfOptions(FormatOptions):
 
     split: Optional[str] = None  # noqa: UP045 - tyro reads these annotations on Python 3.10
     """Folder with events and views to train on, such as train1. None: train, or the only folder train*."""
+    pose_set: Optional[str] = None  # noqa: UP045
+    """Name of the poses that are read, such as perturbed for train/pose_perturbed. None: those in train/pose."""
     duration_s: Optional[float] = None  # noqa: UP045
     """Time from the first view to the last, seconds. None: 1 ms from view to view, since the files have no unit."""
 
 
-def read(folder: Path, split: str | None = None, duration_s: float | None = None) -> EventRecording:
+def read(
+    folder: Path, split: str | None = None, pose_set: str | None = None, duration_s: float | None = None
+) -> EventRecording:
     """Reads everything but the events, which are read when they are needed.
 
     Args:
         folder: The folder of a scene, with the files that the module describes.
         split: Name of the folder with the events.
+        pose_set: Name of other poses of that split; views that are held out keep theirs.
         duration_s: Time from the first view to the last, seconds.
 
     Raises:
         RecordingError: A file is missing, empty or cannot be used.
-        FlagError: There is no such split, or the duration is not above 0.
+        FlagError: There is no such split or set of poses, or the duration is not above 0.
     """
     notes: list[str] = []
     views = folder / _split(folder, split)
-    pose_files, numbers = _pose_files(views)
+    pose_files, numbers = _pose_files(_pose_folder(views, pose_set))
     poses = np.stack([_read_pose(file) for file in pose_files])
     events_file = _events_file(views / "events", notes)
     num_events, span = _survey_times(events_file)
@@ -134,7 +141,9 @@ def read(folder: Path, split: str | None = None, duration_s: float | None = None
     kept = _without_burst(events_file, num_events, times, ns_per_unit, notes)
     positions = poses[kept:, :3, 3]
     rotations = Rotation.from_matrix(poses[kept:, :3, :3]).as_quat()
-    quaternions = unit_quaternions(views / "pose", positions, rotations, notes, lambda row: pose_files[kept + row].name)
+    quaternions = unit_quaternions(
+        pose_files[0].parent, positions, rotations, notes, lambda row: pose_files[kept + row].name
+    )
     trajectory = Trajectory(times[kept:], positions, quaternions)
     farthest = float(np.linalg.norm(positions, axis=1).max())
     if farthest > 1.0:
@@ -168,7 +177,11 @@ def read(folder: Path, split: str | None = None, duration_s: float | None = None
         bayer_pattern=bayer_pattern,
         notes=tuple(notes),
         num_events=num_events,
-        times_in={"events": (events_file, "ns"), "poses": (views / "pose", "ns"), "frames": (views / "rgb", "ns")},
+        times_in={
+            "events": (events_file, "ns"),
+            "poses": (pose_files[0].parent, "ns"),
+            "frames": (views / "rgb", "ns"),
+        },
     )
 
 
@@ -191,9 +204,20 @@ def _split(folder: Path, stated: str | None) -> str:
     return "train" if "train" in trained else trained[0]
 
 
-def _pose_files(views: Path) -> tuple[list[Path], list[int] | None]:
+def _pose_folder(views: Path, pose_set: str | None) -> Path:
+    if pose_set is None:
+        return views / "pose"
+    known = [path.name.removeprefix("pose_") for path in sorted(views.glob("pose_*")) if path.is_dir()]
+    if pose_set not in known:
+        raise FlagError(
+            f"--pose-set {pose_set} asks for pose_{pose_set}, which {views} lacks; "
+            + (f"give one of {', '.join(known)}, or leave it out." if known else "leave it out.")
+        )
+    return views / f"pose_{pose_set}"
+
+
+def _pose_files(folder: Path) -> tuple[list[Path], list[int] | None]:
     """Returns the files of the poses in order of time, and the last number of each name, if all names have one."""
-    folder = views / "pose"
     check_is_folder(folder, "a folder of poses")
     files = sorted(file for file in folder.glob("*.txt") if not {"usable", "start"} & set(re.split(r"[_.]", file.name)))
     if not 2 <= len(files) <= MOST_VIEWS:
@@ -417,7 +441,7 @@ def _matched(images: Sequence[Path], pose_files: Sequence[Path], views: Path) ->
         return list(range(len(images)))
     names = [re.findall(r"\d+", file.stem) for file in pose_files]
     if not all(len(found) > 1 for found in names):  # as in EventNeRF
-        check_one_each(views / "rgb", len(images), views / "pose", len(pose_files), "poses")
+        check_one_each(views / "rgb", len(images), pose_files[0].parent, len(pose_files), "poses")
     by_number = {int(found[0]): view for view, found in enumerate(names)}
     matched = []
     for image in images:
@@ -449,7 +473,7 @@ def _read_held_out(
     if not images:
         return None
     views = folder / name
-    pose_files, _ = _pose_files(views)
+    pose_files, _ = _pose_files(views / "pose")
     matched = _matched(images, pose_files, views)
     check_image_sizes(images, camera.width, camera.height)
     poses = np.stack([_read_pose(pose_files[view]) for view in matched])

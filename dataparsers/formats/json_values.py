@@ -108,6 +108,20 @@ class Value:
             raise value.wrong("a whole number of nanoseconds was")
         return None if value is None else value.found
 
+    def nested(self, side: int) -> Value:
+        """Returns a matrix whose numbers stand in one list, row by row, as a list of rows; other values as they are."""
+        if not isinstance(self.found, list) or len(self.found) != side * side:
+            return self
+        rows = [self.found[start : start + side] for start in range(0, side * side, side)]
+        return Value(self.path, rows, self.name)
+
+    def intrinsics(self) -> list[float]:
+        """Returns fx, fy, cx and cy of a camera matrix of 3 x 3 numbers, nested or in one list."""
+        (fx, skew, cx), (left, fy, cy), last = self.nested(3).numbers((3, 3), "fx 0 cx 0 fy cy 0 0 1 was").tolist()
+        if [skew, left, *last] != [0, 0, 0, 0, 1]:
+            raise self.wrong("fx 0 cx 0 fy cy 0 0 1 was")
+        return [fx, fy, cx, cy]
+
     def pose(self) -> Float64[np.ndarray, "4 4"]:
         """Returns a matrix [R | t] with the last row 0 0 0 1."""
         matrix = self.numbers((4, 4), "a matrix of 4 x 4 numbers was")

@@ -1,4 +1,4 @@
-"""Frames that lie within a larger file, such as a ROS bag, are kept as files in the cache, each written once."""
+"""Frames in a ROS bag, none of which can be read without those before it, are kept as files in the cache."""
 
 from __future__ import annotations
 

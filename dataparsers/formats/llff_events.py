@@ -8,12 +8,12 @@
     all_timestamps.npy           (M,) of that path: µs
     ev_map.npz                   inv_mapx, inv_mapy (height, width): place of each pixel of the sensor in the pictures,
                                  only in CDAVIS, whose sensor has a colour filter RGGB
+    K.yaml                       intrinsics of the pictures, only in Gen3
     NAME_poses_bounds.npy        other poses, with all_NAME_poses_bounds.npy and perhaps all_NAME_timestamps.npy, as
                                  --pose-set asks for: uslam and refined of Gen3, rot0.2_tran0.02 and others of Blender
 
-The columns of R point down, right and back; poses are camera to world. The focal length is that of the first row, and
-the principal point is the middle of the picture, counted from the corner of the first pixel. K.yaml of Gen3 is not
-read, as in the loader of its authors.
+The columns of R point down, right and back; poses are camera to world. Without K.yaml, the focal length is that of the
+first row, and the principal point is the middle of the picture, counted from the corner of the first pixel.
 
 The files leave the following open, and this is how it is decided:
 
@@ -24,6 +24,9 @@ The files leave the following open, and this is how it is decided:
 * Sharp pictures are held out for evaluation, with the poses in poses_bounds.npy. The blurred ones are frames to train
   on, whose poses are those of the whole path; a note tells if the poses of the pictures are far from them.
 * The unit of length is that of the files.
+* The loader of Gen3's authors does not read K.yaml, so that its keys are not known. It is read as a matrix of 3 x 3
+  numbers or as fx fy cx cy, by itself or under K or camera_matrix, whose whole numbers are the centres of pixels, as in
+  OpenCV. A note tells if it holds anything else, or if its focal length is far from that of the poses.
 
 Cannici and Scaramuzza, "Mitigating motion blur in neural radiance fields with events and frames", CVPR 2024; Zou
 et al., "Event-aided sharp radiance field reconstruction for fast-flying drones", T-RO 2026.
@@ -50,6 +53,7 @@ from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
 from enerf_ns.dataparsers.formats.npz_arrays import open_arrays
 from enerf_ns.dataparsers.formats.robust_enerf import checked_trajectory
+from enerf_ns.dataparsers.formats.yaml_values import read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, load_array, of_file, reading
@@ -72,6 +76,9 @@ SAMPLED_PLACES = 20_000
 
 FAR_SHARE, FAR_TURN = 0.02, 2.0
 """Distance between the pose of a picture and the path at its stamp that a note states: share of the extent, degrees."""
+
+FAR_FOCAL_LENGTH = 0.02
+"""Difference between the focal lengths of K.yaml and of the poses that a note states, as a share."""
 
 BAYER_PATTERN = "RGGB"
 
@@ -109,6 +116,8 @@ def read(folder: Path, pose_set: str | None = None) -> EventRecording:
         )
     check_one_each(images[0].parent, len(images), folder / "poses_bounds.npy", len(poses), "poses")
     frame_camera = _read_camera(folder / "poses_bounds.npy", images, sizes)
+    if (intrinsics := folder / "K.yaml").exists():
+        frame_camera = _with_intrinsics(frame_camera, intrinsics, notes)
 
     events_file = folder / "events.h5"
     events = _open_events(events_file, trajectory)
@@ -122,10 +131,6 @@ def read(folder: Path, pose_set: str | None = None) -> EventRecording:
         of_images = poses if own is None else _read_rows(own)[0]
         if len(of_images) == len(images):
             _compare(of_images[~is_sharp], blurred, own or folder / "poses_bounds.npy", notes)
-    if (folder / "K.yaml").exists():
-        notes.append(
-            "K.yaml is not read; the focal length is that of poses_bounds.npy, as in the loader of the authors."
-        )
     near, far = float(bounds[:, 0].min()), float(bounds[:, 1].max())
     with of_file(folder):
         return EventRecording(
@@ -230,6 +235,30 @@ def _read_camera(path: Path, images: Sequence[Path], sizes: Float64[np.ndarray, 
         return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
+def _with_intrinsics(camera: Camera, path: Path, notes: list[str]) -> Camera:
+    """Returns the camera with the intrinsics in a YAML file, if they can be read and lie within the pictures."""
+    try:
+        value = read_yaml(path, "intrinsics")[1]
+        for key in ("K", "camera_matrix", "data"):
+            value = (value.get(key) if isinstance(value.found, dict) else None) or value
+        if isinstance(value.found, dict):
+            stated = value.each("fx", "fy", "cx", "cy")
+        elif isinstance(value.found, list) and len(value.found) == 4:
+            stated = value.numbers((4,)).tolist()
+        else:
+            stated = value.intrinsics()
+        found = value.camera((camera.width, camera.height), stated)
+    except RecordingError as error:
+        notes.append(f"The focal length is that of poses_bounds.npy, since {error}")
+        return camera
+    if abs(found.fx / camera.fx - 1) > FAR_FOCAL_LENGTH:
+        notes.append(
+            f"{path.name} states a focal length of {found.fx:.1f} pixels, which is used, and poses_bounds.npy one of "
+            f"{camera.fx:.1f}."
+        )
+    return found
+
+
 def _open_events(path: Path, trajectory: Trajectory) -> Hdf5Events:
     """Returns the events in the unit in which they and the poses overlap longer; µs if they never do."""
     events = Hdf5Events(path, "ns", floats=True)
@@ -284,10 +313,10 @@ def _lookup(
     """Returns the camera whose pixels lie at places in the pictures; a regular one has `start` and `spacing`."""
     directions = (table - [pictures.cx, pictures.cy]) / [pictures.fx, pictures.fy]
     height, width = table.shape[:2]
-    focal = pictures.fx / spacing
+    fx, fy = pictures.fx / spacing, pictures.fy / spacing
     cx, cy = (pictures.cx - start[0]) / spacing, (pictures.cy - start[1]) / spacing
     with of_file(path):
-        return Camera(width, height, focal, focal, cx, cy, model="lookup", directions=directions)
+        return Camera(width, height, fx, fy, cx, cy, model="lookup", directions=directions)
 
 
 def _read_map(path: Path, pictures: Camera) -> np.ndarray:

@@ -13,14 +13,14 @@ motion needs poses of another source (--poses).
 
 Times are checked: ts_map_prophesee_left and ovc/ts_map_prophesee_left_t name the event at each pose and frame, where
 they are there. Not read: depth, since it is of the event camera at times without frames; the lidar; the right and the
-colour camera of the OVC. The exposure of a frame is not known, and its stamp is taken for its middle.
+colour camera of the OVC. The exposure of a frame is not known, and its stamp is taken for its middle. Frames stay in
+the HDF5 file. In poses of the user that state names of frames, they are 00000.png and so on, as enerf convert writes.
 
 Chaney et al., "M3ED: Multi-robot, multi-sensor, multi-environment event dataset", CVPR workshops 2023; m3ed.io.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,6 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.columns import check_times
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
-from enerf_ns.dataparsers.formats.kept_frames import keep_frames
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseRows
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
@@ -49,6 +48,8 @@ FILES = ("*_data.h5", "*_pose_gt.h5", "*_depth_gt.h5")
 
 DISTORTION_MODELS: dict[str, CameraModel] = {"radtan": "radtan", "equidistant": "fisheye"}
 """Camera models of this package by Kalibr's names."""
+
+FRAMES = "ovc/left/data"
 
 EXPECTED = "an HDF5 file of M3ED"
 
@@ -87,22 +88,20 @@ def read(
         if member_at(path, file, "prophesee/right/calib") is not None:
             _check_side(path, file)
         frame_rig = None
-        if member_at(path, file, "ovc/left/data") is not None:
+        if member_at(path, file, FRAMES) is not None:
             frame_rig = _read_camera(path, file, "ovc/left/calib")
-    files, frame_times = (), np.zeros(0, np.int64)
-    if frame_rig is not None:
-        frame_times = _read_frame_times(path)
-        files, frame_times = keep_frames(path, "ovc/left", partial(_frames, path, frame_rig[0], frame_times))
+    frame_times = np.zeros(0, np.int64) if frame_rig is None else _read_frame_times(path, frame_rig[0])
     if poses is None:
         poses_file, unit = _find_poses(folder), "us"
         rows = _read_poses(poses_file, path, left_from_camera)
     else:
         poses_file, unit = poses.path, poses.unit
-        stamps = dict(zip((file.name for file in files), frame_times.tolist(), strict=True))
+        stamps = {f"{number:05d}.png": time for number, time in enumerate(frame_times.tolist())}
         rows = poses.rows(stamps, notes)
     trajectory = Trajectory(*rows)
     frames = None
-    if frame_rig is not None and files:
+    if frame_rig is not None and len(frame_times):
+        files = tuple(path / FRAMES / str(number) for number in range(len(frame_times)))
         mounting = np.linalg.inv(left_from_camera) @ frame_rig[1]
         frames = Frames(files, frame_times, frame_rig[0], trajectory.of_mounted(mounting))
     return EventRecording(
@@ -248,27 +247,20 @@ def _check_clock(path: Path, name: str, data: Path, times: np.ndarray, indices: 
                 )
 
 
-def _read_frame_times(path: Path) -> np.ndarray:
+def _read_frame_times(path: Path, camera: Camera) -> np.ndarray:
+    """Returns the times (ns) of the frames, which are checked to have the size of the camera and 8 bits."""
     with reading(path, EXPECTED), open_hdf5(path) as file:
         times = _microseconds(path, "ovc/ts", read_dataset(path, file, "ovc/ts", "the times of frames in µs", (None,)))
         name = "ovc/ts_map_prophesee_left_t"
         has_map = member_at(path, file, name) is not None
         indices = read_dataset(path, file, name, "numbers of events", (None,)) if has_map else None
+        expected = "frames, one for each of ovc/ts, of the size of the camera"
+        data = dataset_at(path, file, FRAMES, expected, (len(times), camera.height, camera.width, 1))
+        if data.dtype != np.uint8:
+            raise RecordingError(f"{path} holds {FRAMES} as {data.dtype}, but uint8 was expected.")
     if indices is not None:
         _check_clock(path, name, path, times, indices)
     return times
-
-
-def _frames(path: Path, camera: Camera, times: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    with reading(path, EXPECTED), open_hdf5(path) as file:
-        shape = (len(times), camera.height, camera.width, 1)
-        data = dataset_at(
-            path, file, "ovc/left/data", "frames, one for each of ovc/ts, of the size of the camera", shape
-        )
-        if data.dtype != np.uint8:
-            raise RecordingError(f"{path} holds ovc/left/data as {data.dtype}, but uint8 was expected.")
-        for i, time in enumerate(times.tolist()):
-            yield time, data[i]
 
 
 FORMAT = Format(

@@ -8,9 +8,11 @@ nerfstudio.dataparser_configs.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from enerf_ns.dataparsers.formats import (
     davis,
@@ -180,12 +182,20 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
 
 
 def _check_options(path: Path, found: Format, options: dict[str, object]) -> None:
-    for option in options:
+    for option, value in options.items():
+        flag = f"--{option.replace('_', '-')}"
         having = [format.name for format in formats() if option in (field.name for field in fields(format.options))]
         if found.name not in having:
-            flag = f"--{option.replace('_', '-')}"
             whose = f"is for recordings of {in_words(having)}" if having else "is no option of any format"
             raise FlagError(f"{flag} {whose}, but {path} is read as {found.name}; leave it out.")
+        hint = get_type_hints(found.options)[option]
+        kinds = [part for part in (hint, *get_args(hint)) if get_origin(part) is Literal]
+        choices = [choice for kind in kinds for choice in get_args(kind)]
+        if choices and value is not None and value not in choices:
+            raise FlagError(
+                f"{flag} {value} is no choice for recordings of {found.name}, as which {path} is read; give one of "
+                f"{', '.join(map(str, choices))}, or leave it out."
+            )
 
 
 def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> None:
@@ -210,7 +220,14 @@ def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> Non
 
 def _files_found(path: Path) -> dict[Format, int]:
     """Returns the number of files of each format in a folder."""
-    return {format: sum(any(path.glob(pattern)) for pattern in format.files) for format in formats()}
+    return {format: sum(_is_there(path, pattern) for pattern in format.files) for format in formats()}
+
+
+def _is_there(path: Path, pattern: str) -> bool:
+    """Returns whether a folder has a file of a pattern, while other processes may remove folders in it."""
+    with suppress(FileNotFoundError):
+        return any(path.glob(pattern))
+    return path.is_dir() and _is_there(path, pattern)
 
 
 def _find_format(path: Path) -> Format:

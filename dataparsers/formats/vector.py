@@ -1,4 +1,4 @@
-"""Reader of VECtor, the left event camera and the left grey camera of one small-scale sequence.
+"""Reader of VECtor, an event camera and the left grey camera of one small-scale sequence.
 
     <name>.synced.left_event.hdf5       events/x, y, t (µs), p, and t_offset, µs since 1970, which is added to t
     <name>.synced.gt.txt                t px py pz qx qy qz qw: seconds since 1970, metres; body to world
@@ -9,6 +9,9 @@
         left_regular_camera_intrinsic_results.yaml      plumb_bob, which is radtan)
         camera_mocap_extrinsic_results1.yaml            cam0.T_cam_body (16): body to left grey camera
         small_scale_joint_camera_extrinsic_results.yaml cam2.T_cam0_cam2 (16): left event camera to left grey camera
+
+The right event camera has files named after it in place of those named left_event, and T_cam0_cam3 of cam3. The frames
+are those of the left grey camera in either case.
 
 The pose of the event camera is T_world_body * inv(T_cam_body) * T_cam0_cam2. The file of T_cam_body also holds its
 inverse T_body_cam, and the reader checks that both agree. The poses of the large-scale sequences (corridors, school,
@@ -22,15 +25,16 @@ Gao et al., "VECtor: A versatile event-centric benchmark for multi-sensor SLAM",
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
-from enerf_ns.dataparsers.formats.json_values import Value
 from enerf_ns.dataparsers.formats.text_tables import parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.formats.yaml_values import find_calibration, read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera
@@ -40,8 +44,11 @@ from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.time_units import Times, check_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
-EVENTS, POSES, IMAGES = ".synced.left_event.hdf5", ".synced.gt.txt", ".synced.left_camera"
-FILES = (f"*{EVENTS}", f"*{POSES}", f"*{IMAGES}/timestamp.txt")
+POSES, IMAGES = ".synced.gt.txt", ".synced.left_camera"
+FILES = ("*.synced.*_event.hdf5", f"*{POSES}", f"*{IMAGES}/timestamp.txt")
+
+CAMERAS = {"left": "cam2", "right": "cam3"}
+"""The event cameras in the calibration of all cameras."""
 
 SENSOR_SIZE = (640, 480)
 """Width and height of the event cameras in pixels."""
@@ -49,29 +56,39 @@ SENSOR_SIZE = (640, 480)
 LARGE_SCALE = ("corridors", "school", "units")
 """Begins of the names of sequences whose poses are those of a lidar."""
 
-EVENT_CAMERA, FRAME_CAMERA = "left_event_camera_intrinsic_results.yaml", "left_regular_camera_intrinsic_results.yaml"
+FRAME_CAMERA = "left_regular_camera_intrinsic_results.yaml"
 BODY, JOINT = "camera_mocap_extrinsic_results1.yaml", "small_scale_joint_camera_extrinsic_results.yaml"
 
 INVERSE_TOLERANCE = 1e-3
 """Largest entry of the difference between T_body_cam times T_cam_body and the identity."""
 
 
-def read(folder: Path) -> EventRecording:
+@dataclass(frozen=True)
+class VectorOptions(FormatOptions):
+    """Options of VECtor."""
+
+    event_camera: Literal["left", "right"] = "left"
+    """The event camera that is read."""
+
+
+def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> EventRecording:
     """Reads everything but the events, which are read when they are needed.
 
     Args:
         folder: The folder with the files that the module describes.
+        event_camera: The event camera.
 
     Raises:
         RecordingError: A file is missing, empty or cannot be used, or the sequence is a large-scale one.
     """
-    found = sorted(folder.glob(f"*{EVENTS}"))
+    suffix = f".synced.{event_camera}_event.hdf5"
+    found = sorted(folder.glob(f"*{suffix}"))
     if len(found) != 1:
         raise RecordingError(
-            f"{folder} holds {len(found)} files *{EVENTS}, but the events of one sequence were expected; give each "
+            f"{folder} holds {len(found)} files *{suffix}, but the events of one sequence were expected; give each "
             "sequence its own folder."
         )
-    events, name = Hdf5Events(found[0]), found[0].name.removesuffix(EVENTS)
+    events, name = Hdf5Events(found[0]), found[0].name.removesuffix(suffix)
     if name.startswith(LARGE_SCALE):
         raise RecordingError(
             f"{folder} holds the large-scale sequence {name}, whose poses are those of a lidar, but poses of the "
@@ -89,7 +106,8 @@ def read(folder: Path) -> EventRecording:
     body_file, joint_file = _find(folder, BODY), _find(folder, JOINT)
     body_from_camera = np.linalg.inv(_read_body(body_file))
     body = Trajectory(times - zero, positions, quaternions)
-    event_camera = _matrix(read_yaml(joint_file, "a calibration")[1]["cam2"]["T_cam0_cam2"])
+    number = CAMERAS[event_camera]
+    mount = read_yaml(joint_file, "a calibration")[1][number][f"T_cam0_{number}"].nested(4).pose()
     frames = None
     if files:
         size = image_size(files[0])
@@ -101,8 +119,8 @@ def read(folder: Path) -> EventRecording:
     return EventRecording(
         path=folder,
         format="vector",
-        camera=_read_camera(_find(folder, EVENT_CAMERA), SENSOR_SIZE),
-        trajectory=body.of_mounted(body_from_camera @ event_camera),
+        camera=_read_camera(_find(folder, f"{event_camera}_event_camera_intrinsic_results.yaml"), SENSOR_SIZE),
+        trajectory=body.of_mounted(body_from_camera @ mount),
         stream_events=lambda: events.stream(zero),
         event_files=(events.path,),
         frames=frames,
@@ -152,25 +170,25 @@ def _read_camera(path: Path, size: tuple[int, int]) -> Camera:
         stated = calibration.get(key)
         if stated is not None and stated.numbers(()) != side:
             raise stated.wrong(f"{side} pixels, as the data have, were")
-    matrix = calibration["camera_matrix"]["data"]
-    fx, skew, cx, left, fy, cy, *last = matrix.numbers((9,)).tolist()
-    if [skew, left, *last] != [0, 0, 0, 0, 1]:
-        raise matrix.wrong("fx 0 cx 0 fy cy 0 0 1 was")
+    intrinsics = calibration["camera_matrix"]["data"].intrinsics()
     coefficients = calibration["distortion_coefficients"]["data"]
     count = 4 if isinstance(coefficients.found, list) and len(coefficients.found) == 4 else 5
     distortion = coefficients.numbers((count,), "k1 k2 p1 p2 and perhaps k3 were").tolist()
     model = calibration.get("distortion_model")
     if model is not None:
         model.choice(("plumb_bob", "radtan"))
-    return calibration.camera(size, (fx, fy, cx, cy), distortion, "radtan")
+    return calibration.camera(size, intrinsics, distortion, "radtan")
 
 
 def _read_body(path: Path) -> Float64[np.ndarray, "4 4"]:
     """Returns T_cam_body, which maps from the body to the left grey camera."""
     entry = read_yaml(path, "a calibration")[1]["cam0"]
-    camera_from_body = _matrix(entry["T_cam_body"])
+    camera_from_body = entry["T_cam_body"].nested(4).pose()
     inverse = entry.get("T_body_cam")
-    if inverse is not None and np.abs(_matrix(inverse) @ camera_from_body - np.eye(4)).max() > INVERSE_TOLERANCE:
+    if (
+        inverse is not None
+        and np.abs(inverse.nested(4).pose() @ camera_from_body - np.eye(4)).max() > INVERSE_TOLERANCE
+    ):
         raise RecordingError(
             f"{path} holds T_cam_body and T_body_cam of cam0 that are not inverse to each other, but one calibration "
             "was expected in both; copy it again."
@@ -178,17 +196,11 @@ def _read_body(path: Path) -> Float64[np.ndarray, "4 4"]:
     return camera_from_body
 
 
-def _matrix(value: Value) -> Float64[np.ndarray, "4 4"]:
-    """Returns a rigid motion from 16 numbers, row by row, or from four rows."""
-    if isinstance(value.found, list) and len(value.found) == 16:
-        value = Value(value.path, [value.found[row : row + 4] for row in range(0, 16, 4)], value.name)
-    return value.pose()
-
-
 FORMAT = Format(
     name="vector",
     command="vector-events",
-    description="Events of the left event camera of a small-scale sequence of VECtor.",
+    description="Events of an event camera of a small-scale sequence of VECtor.",
     files=FILES,
     read=read,
+    options=VectorOptions,
 )

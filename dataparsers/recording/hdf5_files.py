@@ -1,8 +1,8 @@
 """Reads HDF5 files that may come from anybody, and pictures and depth maps within them and within .npz files.
 
 A path beyond the file names a picture: data.hdf5/davis/left/image_raw/17 is the picture number 17, from 0, of the
-dataset davis/left/image_raw [pictures, height, width] in data.hdf5; depth.npz/depth_17 is the array depth_17 [height,
-width] in depth.npz.
+dataset davis/left/image_raw [pictures, height, width], perhaps with one channel, in data.hdf5; depth.npz/depth_17 is
+the array depth_17 [height, width] in depth.npz.
 """
 
 from __future__ import annotations
@@ -90,8 +90,9 @@ def _load(path: Path) -> np.ndarray:
             return _load_from_npz(source, last)
         with open_hdf5(source) as file:
             dataset = dataset_in(source, file, "/".join(names), "pictures")
-            _checked(source, dataset.dtype, dataset.shape[1:])
-            return dataset[int(last)]
+            shape = dataset.shape[1:3] + dataset.shape[3:] * (dataset.shape[3:] != (1,))
+            _checked(source, dataset.dtype, shape)
+            return dataset[int(last)].reshape(shape)
 
 
 def _load_from_npz(source: Path, name: str) -> np.ndarray:

@@ -55,6 +55,8 @@ def find_white_level(files: tuple[Path, ...]) -> float:
             stated = max(stated, _stated_white(file))
             if max(largest, stated) >= 2 ** DEPTHS[-2]:
                 break
+    if kind is None:
+        return 255.0
     if kind == np.float32:
         return max(largest, 1.0)
     least = max(largest, stated)

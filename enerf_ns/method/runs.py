@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
     from nerfstudio.pipelines.base_pipeline import Pipeline
 
+    from enerf_ns.dataparsers.formats.format import Format, FormatOptions
     from enerf_ns.method.pipeline import EnerfPipeline
     from enerf_ns.method.trainer import EnerfTrainer, EnerfTrainerConfig
 
@@ -49,12 +50,17 @@ def method_config(
         name: Name of the method, such as `enerf`.
         data: Folder of a recording.
         output_dir: Folder of all runs; each run has a folder of its own in it.
-        changes: Values by the names of ns-train's flags, such as {"pipeline.datamanager.event_pairs": 512}.
+        changes: Values by the names of ns-train's flags, such as {"pipeline.datamanager.event_pairs": 512}. Options of
+            a format follow its name: {"pipeline.datamanager.dataparser.format": "llff_events",
+            "pipeline.datamanager.dataparser.options": {"pose_set": "uslam"}}.
 
     Raises:
-        FlagError: There is no method or no setting of such a name.
+        FlagError: There is no method, setting, format or option of such a name.
     """
     from nerfstudio.configs.method_configs import all_methods
+
+    from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig
+    from enerf_ns.dataparsers.formats.registry import format_named
 
     own = [method for method, known in all_methods.items() if isinstance(known, type(all_methods["enerf"]))]
     if name not in own:
@@ -69,8 +75,20 @@ def method_config(
             owner = getattr(owner, parent, None)
         if not hasattr(owner, attribute):
             raise FlagError(f"The method {name} has no setting {path}; ns-train {name} --help lists all that it has.")
+        if attribute == "options" and isinstance(owner, EventDataParserConfig):
+            value = _options(format_named(owner.format), value)
         setattr(owner, attribute, value)
     return config
+
+
+def _options(format: Format, values: Mapping[str, Any]) -> FormatOptions:
+    try:
+        return format.options(**values)
+    except TypeError as error:
+        known = ", ".join(option.name for option in fields(format.options)) or "none"
+        raise FlagError(
+            f"Recordings of {format.name} lack one of the options {', '.join(values)}; known: {known}."
+        ) from error
 
 
 def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import tyro
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.scripts.train import train_loop
@@ -12,6 +13,7 @@ from small_runs import SMALL
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.method import runs
+from enerf_ns.method.datamanager import EnerfDataManagerConfig
 from enerf_ns.method.runs import Run, load, method_config, set_up
 
 
@@ -27,6 +29,16 @@ def test_a_configuration_is_a_copy_with_changes(tmp_path: Path):
     assert config.data == config.pipeline.datamanager.data == tmp_path / "data"
     assert (config.output_dir, config.vis) == (tmp_path, "tensorboard")
     assert all_methods["enerf"].pipeline.datamanager.held_out_events == before and all_methods["enerf"].data is None
+
+
+def test_a_configuration_with_options_of_a_format_is_that_of_its_sub_command(tmp_path: Path):
+    parser = "pipeline.datamanager.dataparser."
+    changes = {f"{parser}format": "llff_events", f"{parser}options": {"pose_set": "uslam"}}
+    found = method_config("enerf", tmp_path, tmp_path, changes).pipeline.datamanager.dataparser
+    command = tyro.cli(EnerfDataManagerConfig, args=["llff-events", "--pose-set", "uslam"]).dataparser
+    assert (found.format, found.options) == (command.format, command.options)
+    with pytest.raises(FlagError, match=r"of llff_events lack one of the options split; known: pose_set\."):
+        method_config("enerf", tmp_path, tmp_path, {**changes, f"{parser}options": {"split": "train"}})
 
 
 @pytest.mark.parametrize("name", ["nerfacto", "nothing"])

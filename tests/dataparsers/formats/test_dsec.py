@@ -121,6 +121,7 @@ def test_both_sides_in_both_layouts(tmp_path: Path, side: str, number: int, unpa
     check_poses(recording.trajectory, camera_to_world() @ IN_LEFT[number])
     frames = recording.frames
     assert frames is not None and frames.camera == FRAME_CAMERA and frames.exposures is not None
+    assert recording.times_in["frames"][0].name.endswith(".txt") and recording.times_in["frames"][0].exists()
     np.testing.assert_array_equal(frames.times, FRAME_TIMES)
     np.testing.assert_array_equal(frames.exposures, EXPOSURES)
     frame = {0: 1, 3: 2}[number]

@@ -126,6 +126,24 @@ def test_synthetic_scene(tmp_path: Path, unit: float | None):
     assert len(index_events(recording)) == len(EVENTS)
 
 
+@pytest.mark.parametrize("name", ["perturbed", "deg=0.3_cm=2"])
+def test_sets_of_poses(tmp_path: Path, name: str):
+    """Views that are held out keep their poses."""
+    folder = write_e3dgs(tmp_path / "scene")
+    for file in (folder / "train/pose").glob("*_cam_*.txt"):
+        pose = np.loadtxt(file)
+        pose[:3, 3] += [0.02, 0, -0.01]
+        write_matrix(folder / f"train/pose_{name}" / file.name, pose, rows=True)
+    given, other = read_recording(folder), read_recording(folder, pose_set=name)
+    np.testing.assert_array_equal(other.trajectory.times, given.trajectory.times)
+    np.testing.assert_allclose(other.trajectory.positions, poses()[:, :3] + [0.02, 0, -0.01], rtol=0, atol=1e-12)
+    assert given.held_out_frames is not None and other.held_out_frames is not None
+    kept = other.held_out_frames.trajectory.positions
+    np.testing.assert_array_equal(kept, given.held_out_frames.trajectory.positions)
+    with pytest.raises(FlagError, match=rf"--pose-set uslam asks for pose_uslam, .*; give one of {name}, or leave it"):
+        read_recording(folder, pose_set="uslam")
+
+
 def test_the_duration_can_be_stated(tmp_path: Path):
     recording = read_recording(write_eventnerf(tmp_path / "lego"), duration_s=2.5)
     np.testing.assert_array_equal(recording.trajectory.times, np.arange(VIEWS) * 250_000_000)

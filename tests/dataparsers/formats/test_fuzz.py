@@ -1120,6 +1120,7 @@ def test_undamaged(template: Template):
     check_index(recording, rows)
     check_plain(recording, rows, template.layout.read_plain(template.folder))
     assert read_recording(template.folder).format == template.layout.format
+    assert all(place.exists() for place, _ in recording.times_in.values())  # errors name them
 
 
 @settings(FUZZ, max_examples=30)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import yaml
 from recordings import HEIGHT, POSE_TIMES, WIDTH, image, joined, poses, write_image
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.registry import _read_folder, read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 
 FOCAL = 21.5
@@ -198,6 +201,54 @@ def test_floats_that_are_whole_are_pixels(tmp_path: Path):
     np.testing.assert_array_equal(np.column_stack([found.x, found.y]), EVENTS[:, :2])
     assert found.x.dtype.kind == "i" and (np.diff(found.t) > 0).all()
     np.testing.assert_array_equal(found.t % 1000, (found.t[0] % 1000))
+
+
+K = [[FOCAL + 0.1, 0, 11.3], [0, FOCAL - 0.2, 8.8], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        K,
+        [*K[0], *K[1], *K[2]],
+        [K[0][0], K[1][1], K[0][2], K[1][2]],
+        {"K": K},
+        {"camera_matrix": {"rows": 3, "cols": 3, "data": [*K[0], *K[1], *K[2]]}},
+        {"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
+    ],
+    ids=["rows", "nine numbers", "four numbers", "K", "camera_matrix", "fx fy cx cy"],
+)
+def test_intrinsics_of_gen3(tmp_path: Path, content: Any):
+    """Events between pixels are seen where the matrix says, too."""
+    folder = write_rectified(tmp_path / "handheld", with_map=False)
+    (folder / "K.yaml").write_text(yaml.safe_dump(content))
+    recording = read_recording(folder)
+    frames = recording.blurred_frames
+    assert frames is not None and frames.camera == Camera(WIDTH, HEIGHT, K[0][0], K[1][1], K[0][2], K[1][2])
+    assert len(recording.notes) == 1 and "places between the pixels" in recording.notes[0]
+    found = joined(recording.stream_events())
+    seen = recording.camera.pixel_directions()[found.y, found.x, :2]
+    u, v = (column[EVENTS[:, 1], EVENTS[:, 0]].astype(float) for column in places())
+    expected = np.linalg.solve(np.array(K), np.stack([u, v, np.ones_like(u)]))[:2].T
+    np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "note", "focal_length"),
+    [
+        ("focal: 20\n", r"is that of poses_bounds\.npy, since .*K\.yaml lacks fx, which was expected", FOCAL),
+        ("%YAML:1.0\nK: !!opencv-matrix\n", r"is that of poses_bounds\.npy, since .*K\.yaml.* cannot be read", FOCAL),
+        ("[1, 2]", r"is that of poses_bounds\.npy, since .*but fx 0 cx 0 fy cy 0 0 1 was", FOCAL),
+        ("[30, 30, 11, 8]", r"^K\.yaml states a focal length of 30\.0 pixels, which is used, and poses_bounds", 30),
+    ],
+    ids=["other keys", "another YAML", "two numbers", "another lens"],
+)
+def test_other_intrinsics_of_gen3_are_noted(tmp_path: Path, content: str, note: str, focal_length: float):
+    folder = write_llff_events(tmp_path / "handheld")
+    (folder / "K.yaml").write_text(content)
+    recording = read_recording(folder)
+    assert recording.camera.fx == focal_length
+    assert len(recording.notes) == 1 and re.search(note, recording.notes[0])
 
 
 def test_sets_of_poses(tmp_path: Path):

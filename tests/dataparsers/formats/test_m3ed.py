@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
 
 from enerf_ns.dataparsers.formats import m3ed
+from enerf_ns.dataparsers.formats.conversion import convert_recording
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.dataparsers.recording.hdf5_files import file_of, load_picture
 
 CAMERA = Camera(WIDTH, HEIGHT, 20.0, 21.0, 11.5, 8.5, (-0.1, 0.02, 0.001, -0.002), "radtan")
 FRAME_CAMERA = Camera(WIDTH, HEIGHT, 25.0, 25.0, 11.0, 9.0, (0.01, 0.002, 0.0, 0.001), "fisheye")
@@ -90,7 +91,20 @@ def test_the_left_camera(tmp_path: Path, poses_in: str):
     np.testing.assert_array_equal(frames.times, FRAME_TIMES)
     check_poses(frames.trajectory, camera_to_world() @ OVC)
     for i, file in enumerate(frames.filenames):
-        np.testing.assert_array_equal(load_image(file), image(i))
+        np.testing.assert_array_equal(load_picture(file), image(i))
+
+
+def test_frames_stay_in_their_file_until_they_are_converted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ENERF_CACHE", str(tmp_path / "cache"))
+    folder = write_m3ed(tmp_path / "m3ed")
+    frames = read_recording(folder).frames
+    assert frames is not None and {file_of(file) for file in frames.filenames} == {folder / "seq_data.h5"}
+    assert not (tmp_path / "cache").exists()
+    convert_recording(folder, tmp_path / "new")
+    names = sorted((tmp_path / "new/frames").glob("*.png"))
+    for i, file in enumerate(names):
+        np.testing.assert_array_equal(load_picture(file), image(i))
+    assert [file.name for file in names] == ["00000.png", "00001.png", "00002.png"]  # as poses of the user name them
 
 
 def test_the_right_camera(tmp_path: Path):

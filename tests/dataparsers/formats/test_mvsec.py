@@ -172,6 +172,48 @@ def test_pictures_without_distortion_show_points_where_they_are(tmp_path: Path):
     check_pictures_show(frames, scene.spots)
 
 
+RIGHT_FROM_LEFT = np.eye(4)
+RIGHT_FROM_LEFT[:3, :3], RIGHT_FROM_LEFT[:3, 3] = Rotation.from_rotvec([0.01, 0.04, -0.02]).as_matrix(), [-0.1, 0, 0.01]
+
+
+def write_right(folder: Path, scene: Scene, right_from_left: np.ndarray = RIGHT_FROM_LEFT) -> Path:
+    """What the left DAVIS saw is the right one's, but for the poses."""
+    write_mvsec(folder, scene)
+    with h5py.File(folder / f"{STEM}_data.hdf5", "r+") as file:
+        del file["davis/right"]
+        file.move("davis/left", "davis/right")
+    with h5py.File(folder / f"{STEM}_gt.hdf5", "r+") as file:
+        file.create_group("davis/right")
+        for name in ("depth_image_raw", "depth_image_raw_ts"):
+            file.move(f"davis/left/{name}", f"davis/right/{name}")
+    tree = yaml.safe_load((folder / CAMCHAIN).read_text())
+    tree["cam1"]["T_cn_cnm1"] = right_from_left.tolist()
+    tree["cam0"]["intrinsics"] = [80, 80, 50, 40]
+    (folder / CAMCHAIN).write_text(yaml.safe_dump(tree))
+    return folder
+
+
+def test_the_right_camera(tmp_path: Path):
+    """Against SciPy and OpenCV's fisheye, from the poses of the left one."""
+    scene = make_scene()
+    recording = read_recording(write_right(tmp_path / "flight", scene), event_camera="right")
+    poses = at(scene.pose_times, scene.poses @ np.linalg.inv(RIGHT_FROM_LEFT), scene.events[:, 2])
+    depths = np.random.default_rng(3).uniform(0.5, 5, NUM_EVENTS)
+    check_events_see(recording, points_seen(scene.events[:, :2].copy(), depths, poses, MATRIX, DISTORTION, "fisheye"))
+    frames, maps = recording.frames, recording.depth_maps
+    assert frames is not None and maps is not None and maps.trajectory is recording.trajectory
+    np.testing.assert_array_equal(frames.image(1)[..., 0], scene.frames[1])
+    assert maps.depth(1) is not None
+
+
+def test_a_right_camera_on_the_left_is_refused(tmp_path: Path):
+    folder = write_right(tmp_path / "flight", make_scene(), np.linalg.inv(RIGHT_FROM_LEFT))
+    with pytest.raises(
+        RecordingError, match=r"places cam1, the right DAVIS, 0\.\d+ m to the left of cam0 by T_cn_cnm1"
+    ):
+        read(folder, "right")
+
+
 def test_depth_maps_have_an_instant_and_a_camera_of_their_own(tmp_path: Path):
     """Against OpenCV's map of the pixels without distortion."""
     scene = make_scene()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from enerf_ns.dataparsers import event_dataparser
 from enerf_ns.dataparsers.formats import registry
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import (
+    check_outside_recordings,
     format_named,
     formats,
     layouts,
@@ -26,7 +28,7 @@ from enerf_ns.dataparsers.formats.registry import (
 )
 from enerf_ns.dataparsers.formats.writer import Setup
 from enerf_ns.dataparsers.recording.camera import Camera
-from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.scripts.format_options import format_flags
@@ -129,6 +131,8 @@ def test_options_that_the_format_lacks(basket: Path, tmp_path: Path):
         read_recording(esim, basket="red")
     with pytest.raises(FlagError, match=r"^--event-camera is for recordings of tum_vie.* and basket, but .* as esim"):
         read_recording(esim, "esim", event_camera="left")
+    with pytest.raises(FlagError, match=r"^--event-camera right is no choice for .* basket, .*; .* of left, middle, "):
+        read_recording(basket, event_camera="right")  # a choice of other formats
     with pytest.raises(FlagError, match=r"^--lid-open is no option of any format, but .* is read as basket"):
         read_recording(basket, lid_open=True)
 
@@ -182,3 +186,20 @@ def test_the_published_cameras_of_tum_vie_are_those_of_its_calibration(shared_da
         pose[:3, 3] = [mount[f"p{axis}"] for axis in "xyz"]
         poses.append(pose)
     np.testing.assert_allclose(poses[0] @ event_from_frame, poses[1], atol=1e-12)
+
+
+def test_a_folder_that_is_removed_while_it_is_looked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As temporary folders are, which other processes make beside an output."""
+    write_esim(tmp_path / "esim")
+    (tmp_path / "esim/train0").mkdir()
+    scandir = os.scandir
+
+    def removed_first(path: Path | str):
+        if Path(path).name == "train0":
+            Path(path).rmdir()
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", removed_first)
+    with pytest.raises(OutputError, match="lies within the recording"):
+        check_outside_recordings("--output-dir", tmp_path / "esim/new")
+    assert not (tmp_path / "esim/train0").exists()

@@ -182,6 +182,23 @@ def test_events_are_seen_where_the_points_are(tmp_path: Path):
     check_events_see(recording, points)
 
 
+def test_the_right_event_camera(tmp_path: Path):
+    """It has files of its own, and cam3 of the calibration."""
+    scene = make_scene()
+    folder = write_vector(tmp_path / "desk", scene)
+    for name in (f"{NAME}.synced.left_event.hdf5", "left_event_camera_intrinsic_results.yaml"):
+        (folder / name).rename(folder / name.replace("left", "right"))
+    frame_from_right = motion([-0.02, 0.013, 0.004], [0.17, -0.04, -0.012])
+    stated(JOINT, "cam3", "T_cam0_cam3", value=frame_from_right.ravel().tolist())(folder)
+    recording = read_recording(folder, event_camera="right")
+    poses = scene.poses(np.linalg.inv(CAMERA_FROM_BODY) @ frame_from_right, scene.events[:, 2] * 1000)
+    depths = np.random.default_rng(3).uniform(0.5, 5, NUM_EVENTS)
+    points = points_seen(scene.events[:, :2].astype(float).copy(), depths, poses, EVENT_MATRIX, EVENT_LENS)
+    check_events_see(recording, points)
+    assert recording.frames is not None
+    check_pictures_show(recording.frames, scene.spots)  # of the left grey camera
+
+
 def test_pictures_without_distortion_show_points_where_they_are(tmp_path: Path):
     scene = make_scene()
     frames = read(write_vector(tmp_path / "desk", scene)).frames

@@ -142,6 +142,11 @@ def test_values_that_fill_16_bits_are_of_16_bits_whatever_sbit_states(tmp_path: 
     assert find_white_level((tmp_path / "a.png",)) == 65535
 
 
+def test_pictures_of_8_bits_alone_have_the_white_level_of_8_bits(tmp_path: Path):
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "a.png")
+    assert find_white_level((tmp_path / "a.png",)) == find_white_level(()) == 255
+
+
 @pytest.mark.parametrize("value", [-0.5, np.nan, np.inf])
 def test_floats_that_are_no_brightness_are_refused(tmp_path: Path, value: float):
     pixels = truth()[..., 0].astype(np.float32)
