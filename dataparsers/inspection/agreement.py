@@ -113,6 +113,11 @@ class Estimate:
     is_identifiable: bool
     """Whether the recording determines the value. If not, value and error mean nothing."""
 
+    @property
+    def may_be_zero(self) -> bool:
+        """Whether the value is identifiable and does not differ significantly from 0."""
+        return self.is_identifiable and abs(self.value) <= 3 * self.error
+
 
 @dataclass(frozen=True)
 class CornerFit:
@@ -444,6 +449,13 @@ class Agreement:
                 "either way, but the scene may stand upside down.",
             )
 
+    @property
+    def mended_reading(self) -> Reading | None:
+        """The convention that alone fits the poses, if it is another one than they were read in, and no mirror
+        image."""
+        reading, *others = self.readings
+        return reading if self.is_clear and reading is not AS_READ and not others and reading.is_rotation else None
+
     def _mend_of_readings(self) -> str:
         """The advice if the events contradict the reading in which the poses were read."""
         likeliest, *others = self.readings
@@ -452,8 +464,10 @@ class Agreement:
             return "This motion does not show which of these readings is right" + (f"; {fault}" if fault else "")
         if likeliest.exchanges:
             return fault[0].upper() + fault[1:]
-        flag = likeliest.flag and f", or give {likeliest.flag} with --poses to enerf convert"
-        return f"{_mend(likeliest)} in their file{flag}" + (f"; or, {fault}" if fault else "")
+        is_of_camera = self.focus.recording.trajectory.body is None  # else the poses in the file are those of a body
+        accepts = self.mended_reading is not None and is_of_camera
+        mended = ", or let enerf convert --accept-found write a recording with poses that fit" if accepts else ""
+        return f"{_mend(likeliest)} in their file{mended}" + (f"; or, {fault}" if fault else "")
 
     def _clock_problems(self) -> Iterator[Problem]:
         late = self._lateness()
@@ -554,6 +568,8 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
                 for delayed in trials.delayed(reading):
                     heights[reading] = max(heights[reading], float(trials.curve([delayed]).sum()))
             readings, is_clear = _best_readings(recording.trajectory, heights, slides)
+        if not is_clear and max(heights, key=heights.__getitem__) is AS_READ:
+            is_clear = trials.delay(AS_READ, 1.0).may_be_zero
         lens = other.focal_scale if other is not None and AS_READ in readings else 1.0
         if found is None or is_clear:
             found = trials, readings, is_clear, lens

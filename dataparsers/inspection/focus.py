@@ -78,8 +78,6 @@ class Reading:
     """Whether x and y of the sensor are exchanged, before the signs count."""
     fault_of_events: str = ""
     """Fault of the events that has the same effect, and what to do. It can follow "if the poses are right,"."""
-    flag: str = ""
-    """Flag of `enerf convert` that states this convention."""
 
     @property
     def axes(self) -> Float64[np.ndarray, "3 3"]:
@@ -114,10 +112,10 @@ def _axes(signs: tuple[float, float, float]) -> str:
 
 
 AS_READ = Reading("the convention in which they were read")
-OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1), flag="--poses-axes opengl")
-ROS = Reading("ROS's axes of a body with x forward, y left, z up", _from_ros, flag="--poses-axes ros")
-INVERSE = Reading("world to camera, the inverse", _inverse, flag="--poses-direction world-to-camera")
-SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)), flag="--poses-quaternions wxyz")
+OPENGL = Reading(f"OpenGL's camera {_axes((1, -1, -1))}", signs=(1, -1, -1))
+ROS = Reading("ROS's axes of a body with x forward, y left, z up", _from_ros)
+INVERSE = Reading("world to camera, the inverse", _inverse)
+SCALAR_FIRST = Reading("quaternions in the order w x y z", _reordered((1, 2, 3, 0)))
 SCALAR_LAST = Reading("quaternions in the order x y z w", _reordered((3, 0, 1, 2)))
 EXCHANGED = Reading(
     "axes of a sensor whose x and y are exchanged (x down, y right)",
@@ -209,7 +207,8 @@ class EventFocus:
     Sharpness is the variance of the image of moved events (Gallego et al., "A Unifying Contrast Maximization
     Framework", CVPR 2018), summed over the pixels and divided by the number of events. All hypotheses are measured with
     the same events. Events that leave the view, or go behind the camera, add nothing. Magnification does not count as
-    sharpness.
+    sharpness. A view without distortion is stretched towards the border of a wide lens, the less the longer its focal
+    length. Events are weighted by this stretch, since a picture has the same sharpness then, however it is stretched.
 
     Args:
         recording: Its index is made if it is not there yet.
@@ -231,6 +230,7 @@ class EventFocus:
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
         self._trajectories = {AS_READ: recording.trajectory}
         self._cameras: dict[tuple[float, bool], Camera] = {}
+        self._stretches: dict[tuple[float, bool], Float64[np.ndarray, "height width"]] = {}
 
     @property
     def speed(self) -> float:
@@ -300,10 +300,12 @@ class EventFocus:
 
         moment = np.rint((events.t - window.start) * ((len(times) - 1) / (window.end - window.start))).astype(int)
         camera = self._camera(hypothesis)
-        rays, centres = rays_in_view(camera.pixel_directions()[events.y, events.x], poses[moment], poses[-1])
+        directions = camera.pixel_directions()[events.y, events.x]
+        rays, centres, ahead = rays_in_view(directions, poses[moment], poses[-1])
         planes = PLANES[grid_focal_length(camera) > NEAREST_PLANE * PLANES] if reach else PLANES[:1]
         centres = centres / (reach or 1.0)
-        dispersion, votes = sweep_planes(rays, centres, camera, planes)
+        stretch = self._stretch(hypothesis)[events.y, events.x]
+        dispersion, votes = sweep_planes(rays, centres, camera, planes, stretch[ahead])
         return dispersion * votes * TILE**2 / len(events), rays, centres, planes
 
     def _trajectory(self, reading: Reading) -> Trajectory:
@@ -341,6 +343,15 @@ class EventFocus:
                 fx, fy, cx, cy = fy, fx, cy, cx
             self._cameras[scale, turns] = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy, directions=directions)
         return self._cameras[scale, turns]
+
+    def _stretch(self, hypothesis: Hypothesis) -> Float64[np.ndarray, "height width"]:
+        """The factor by which each pixel is wider and higher, in the mean, in the view without distortion."""
+        key = hypothesis.focal_scale, hypothesis.reading.exchanges
+        if key not in self._stretches:
+            camera = self._camera(hypothesis)
+            (right_x, right_y), (down_x, down_y) = (np.moveaxis(step, 2, 0) for step in camera.pixel_steps())
+            self._stretches[key] = camera.fx * np.sqrt(np.abs(right_x * down_y - right_y * down_x))
+        return self._stretches[key]
 
 
 def largest_delay(recording: EventRecording) -> int:

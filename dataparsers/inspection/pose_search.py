@@ -34,8 +34,8 @@ def mend_poses(folder: Path, place: Path) -> list[str]:
     found = _agreement(folder, place, with_frames=False)
     if found is None:
         return ["The events are too few for a search of the convention and the clock of the poses."]
-    sentences, reading = [], found.readings[0]
-    if found.is_clear and AS_READ not in found.readings and len(found.readings) == 1 and reading.is_rotation:
+    sentences, reading = [], found.mended_reading
+    if reading is not None:
         gain = found.sharpness[Hypothesis(reading=reading)] / found.sharpness[AS_STATED]
         sentences.append(f"The poses are read as {reading.words}, since events are then {gain:.1f} times as sharp.")
         body = reading.of(found.focus.recording.trajectory)

@@ -35,6 +35,9 @@ EVENTS_AT_ONCE = 2**24
 MAX_SHARE_OUTSIDE = 0.05
 """Largest share of events or frames without poses. A camera that starts a moment before the tracker loses less."""
 
+SMALLEST_PART = 0.25
+"""Least share of the time with poses in a part without gaps that an advice names."""
+
 MAX_TURN = 5.0
 """Largest turn of the camera between two poses, degrees. A hand's angular acceleration of 1000 degrees/s² turns the
 camera by 2.5 degrees between poses at 20 poses per second. Interpolation is then wrong by 0.3 degrees, a few pixels."""
@@ -303,12 +306,15 @@ def _pose_problems(
     usual_interval = f"{np.median(np.diff(times)) * 1e-6:.3g} ms"
     if len(gaps):
         begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
+        ends = np.concatenate([times[:1], gaps.ravel(), times[-1:]])
+        parts = ends[1::2] - ends[::2]
+        is_enough = parts.max() >= SMALLEST_PART * parts.sum()
         yield Problem(
             f"There are no poses for {(end - begin) * 1e-9:.3g} s from {begin * 1e-9:.2f} s on"
             + (f", and in {_count(len(gaps) - 1, 'other gap')}" if len(gaps) > 1 else "")
             + f", while they usually come every {usual_interval}; events and frames there are "
             + ("used with interpolated poses." if recording.keep_pose_gaps else "left out."),
-            f"Add the poses that are missing, or use a part that the tracker saw: {flag}.",
+            "Add the poses that are missing" + (f", or use a part that the tracker saw: {flag}." if is_enough else "."),
         )
     inside = ~np.isin(times[:-1], gaps[:, 0])
     if inside.any() and (turn := math.degrees(np.percentile(turns[inside], 99))) > MAX_TURN:

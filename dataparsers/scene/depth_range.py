@@ -298,7 +298,7 @@ def _sweeps(
             chosen = _events_seen_within(baseline / 2, reference, events, *path)
             if len(chosen) > EVENTS_PER_SWEEP:
                 chosen = generator.choice(chosen, EVENTS_PER_SWEEP, replace=False)
-            rays, centres = rays_in_view(
+            rays, centres, _ = rays_in_view(
                 directions[events.y[chosen], events.x[chosen]],
                 trajectory.poses(torch.from_numpy(events.t[chosen])).numpy(),
                 trajectory.poses(torch.as_tensor(reference)).numpy(),
@@ -342,12 +342,13 @@ def rays_in_view(
     directions: Float64[np.ndarray, "rays 3"],
     poses: Float64[np.ndarray, "rays 3 4"],
     view: Float64[np.ndarray, "3 4"],
-) -> tuple[Float64[np.ndarray, "rays 3"], Float64[np.ndarray, "rays 3"]]:
-    """Directions (z = 1) and centres of rays in the axes of a view, without rays that point away from the view."""
+) -> tuple[Float64[np.ndarray, "ahead 3"], Float64[np.ndarray, "ahead 3"], Bool[np.ndarray, " rays"]]:
+    """Directions (z = 1) and centres, in the axes of a view, of those rays that do not point away from it; and which
+    rays these are."""
     rays = np.einsum("nij,nj->ni", poses[:, :, :3], directions) @ view[:, :3]
     centres = (poses[:, :, 3] - view[:, 3]) @ view[:, :3]
     ahead = rays[:, 2] > 0.1
-    return rays[ahead] / rays[ahead, 2:], centres[ahead]
+    return rays[ahead] / rays[ahead, 2:], centres[ahead], ahead
 
 
 def sweep_planes(
@@ -355,6 +356,7 @@ def sweep_planes(
     centres: Float64[np.ndarray, "rays 3"],
     camera: Camera,
     disparities: Float64[np.ndarray, " planes"],
+    weights: Float64[np.ndarray, " rays"] | None = None,
 ) -> Float64[np.ndarray, "2 planes tiles"]:
     """Dispersion of the votes, and votes per grid pixel, of each tile of the view at each plane.
 
@@ -366,6 +368,7 @@ def sweep_planes(
         centres: Their origins, in units of the baseline.
         camera: Of the view.
         disparities: Of the planes, grid pixels: focal length times baseline over depth.
+        weights: Of the votes. Default: 1.
     """
     scale, focal = grid_scale(camera), grid_focal_length(camera)
     columns, rows = (round(side * scale) // TILE for side in (camera.width, camera.height))
@@ -373,12 +376,13 @@ def sweep_planes(
     drift = centres[:, :2] - centres[:, 2:] * rays[:, :2]
     votes, squares = np.zeros((2, len(disparities), rows * columns))
     approach, counts = np.ascontiguousarray(centres[:, 2]) / focal, np.empty((rows * TILE, columns * TILE))
-    compiled(_vote)(start, drift, approach, disparities, counts, votes, squares)
+    weights = np.ones(len(rays)) if weights is None else weights
+    compiled(_vote)(start, drift, approach, weights, disparities, counts, votes, squares)
     votes, squares = votes / TILE**2, squares / TILE**2
     return np.stack([(squares - votes**2) / np.maximum(votes, 1e-9), votes])
 
 
-def _vote(start, drift, approach, disparities, counts, votes, squares):
+def _vote(start, drift, approach, weights, disparities, counts, votes, squares):
     """Adds up, for each plane and tile, the votes of all rays and the squares of the counts of its grid pixels."""
     height, width = counts.shape
     for plane, disparity in enumerate(disparities):
@@ -387,7 +391,7 @@ def _vote(start, drift, approach, disparities, counts, votes, squares):
             x = start[ray, 0] + disparity * drift[ray, 0] + 0.5
             y = start[ray, 1] + disparity * drift[ray, 1] + 0.5
             if 0.0 <= x < width and 0.0 <= y < height:  # weighted by area, so that magnification is no sharpness
-                counts[int(y), int(x)] += (1.0 - disparity * approach[ray]) ** 2
+                counts[int(y), int(x)] += weights[ray] * (1.0 - disparity * approach[ray]) ** 2
         for row in range(height):
             for column in range(width // TILE):
                 vote, square = 0.0, 0.0

@@ -157,7 +157,7 @@ def _view_at(
     if not baseline:
         return None
     nearest = np.searchsorted((instants[1:] + instants[:-1]) // 2, t)
-    rays, centres = rays_in_view(camera.pixel_directions()[y, x], poses[nearest], pose)
+    rays, centres, _ = rays_in_view(camera.pixel_directions()[y, x], poses[nearest], pose)
     scale, focal = grid_scale(camera), grid_focal_length(camera)
     principal_point = ((camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5)
     columns, rows = (round(side * scale) for side in (camera.width, camera.height))

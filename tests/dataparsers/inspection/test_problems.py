@@ -215,6 +215,14 @@ def test_frames_that_are_held_out_between_others_are_not_missing():
     assert find_problems(replace(recording, frames=recording.frames.subset(kept))) == []
 
 
+def test_no_part_is_advised_where_poses_come_in_short_bursts():
+    """As those of the exposures of E2NeRF, each of which is no recording by itself."""
+    times, positions, rotation_vectors = good_poses()
+    keep = np.arange(len(times)) % 40 < 10
+    (problem,) = find_problems(made(poses=(times[keep], positions[keep], rotation_vectors[keep])))
+    assert "in 9 other gaps" in problem.what and problem.advice == "Add the poses that are missing."
+
+
 def test_a_recording_without_frames_needs_none():
     assert find_problems(made(frame_times=FRAME_TIMES[:0])) == []
 
