@@ -56,6 +56,7 @@ def test_the_protocol_fits_one_scale_and_one_power_over_all_frames():
 
     def scores(scales: tuple[float, float]) -> dict[str, float]:
         protocol = LogAffineSet()
+        protocol.evaluate({"color": frames[0][::-1]}, {"images": [frames[0]]})  # one that is shown during training
         pairs = zip(scales, frames, strict=True)
         return protocol.accumulate_metrics(
             protocol.evaluate({"color": scale * frame**1.3}, {"images": [frame]}) for scale, frame in pairs

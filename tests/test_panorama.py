@@ -108,6 +108,20 @@ def test_its_report_has_no_depth_and_its_surface_is_refused(panorama: Run, tmp_p
         surface_views(panorama.pipeline)
 
 
+@torch.no_grad()
+def test_pictures_of_ns_render_have_no_depth(panorama: Run):
+    pipeline = panorama.pipeline.eval()
+    shown = pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[:1])
+    assert {"rgb", "display", "accumulation"} <= set(shown) and not {"depth", "normals", "confidence"} & set(shown)
+
+
+def test_a_recording_that_is_simulated_from_it_has_no_depth(panorama: Run, tmp_path: Path):
+    settings = SimulationSettings(from_run=panorama.config_file, duration=0.05, num_frames=2, exposure_ms=0.0)
+    simulate(settings, tmp_path / "recording")
+    frames = read_recording(tmp_path / "recording").frames
+    assert frames is not None and len(frames.times) == 2 and frames.depth_filenames is None
+
+
 def test_it_can_be_forced_for_any_recording(recording: Path, tmp_path: Path):
     config = small_config(recording, tmp_path, model__panorama=True)
     assert config.resolved().pipeline.model.panorama

@@ -6,6 +6,7 @@ import re
 from importlib.metadata import distribution
 from pathlib import Path
 
+import pytest
 from nerfstudio.configs import external_methods
 from nerfstudio.configs.external_methods import ExternalMethod
 
@@ -30,6 +31,16 @@ def test_the_entry_registers_every_method_of_this_package_and_no_other():
     assert sorted(slugs) == sorted(point.name for point in points if point.group == "nerfstudio.method_configs")
     taken = {slug for method in external_methods.external_methods for slug, _ in method.configurations}
     assert not taken & set(slugs)
+
+
+def test_nerfstudio_offers_every_method_of_the_entry(monkeypatch: pytest.MonkeyPatch):
+    """As its ns-train does where this package is not installed."""
+    added = entry()
+    monkeypatch.setattr(external_methods, "external_methods", [*external_methods.external_methods, added])
+    configs, descriptions = external_methods.get_external_methods()
+    for slug, text in added.configurations:
+        assert configs[slug].method.pip_package == distribution("enerf-ns").metadata["Name"]
+        assert descriptions[slug] == f"[External, run 'ns-train {slug}' to install] {text}"
 
 
 def test_the_entry_is_shown_by_nerfstudio_and_names_the_page_and_one_command():

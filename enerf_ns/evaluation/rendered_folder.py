@@ -75,7 +75,7 @@ def rendered_views(folder: Path, frames: Frames, colour_filter: bool) -> list[He
                 f"{file} has {found[0]} x {found[1]} pixels, but its frame has {camera.width} x {camera.height}; "
                 "render the size of the frames, or give the factor between both by --downscale-factor."
             )
-    white = find_white_level(tuple(pictures)) if pictures else 255.0
+    white = find_white_level(tuple(pictures))
     return [
         HeldOutView(
             recorded=_in_colour(brightness(frames.picture(number))),

@@ -510,12 +510,16 @@ class EnerfModel(Model):
         return scores, images
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Outputs of a camera for the viewer and ns-render.
+        """Outputs of a camera for ns-render.
 
         rgb is linear brightness, clipped to 1, since their conversion to 8 bits would wrap round. display is brightness
-        as in the pictures of `enerf report`, and is computed when it is read.
+        as in the pictures of `enerf report`, and is computed when it is read. A panorama has no depth, and so no
+        normals and no confidence.
         """
         outputs = super().get_outputs_for_camera(camera, obb_box)
+        if self.config.panorama:
+            for name in ("depth", "normals", "confidence"):
+                del outputs[name]
         rgb, display = outputs["rgb"], self.display
         if display is not None:
             outputs["display"] = lambda: display(rgb)  # type: ignore[assignment]

@@ -16,8 +16,7 @@ from enerf_ns.evaluation.protocols import DEFAULT_PROTOCOL, align
 class LogAffineSet:
     """Scores of renders after one scale and one offset of log brightness, fitted over all held-out frames together.
 
-    Events do not determine these two numbers. One object scores one set of frames: `evaluate` is called for each, and
-    `accumulate_metrics` once.
+    Events do not determine these two numbers. `accumulate_metrics` scores the frames that are evaluated while it runs.
     """
 
     def __init__(self) -> None:
@@ -50,8 +49,9 @@ class LogAffineSet:
 
         Args:
             metrics: An iterator whose items call `evaluate`. Their values, which are of fits to single frames, do not
-                count.
+                count; nor do frames that were evaluated before, which nerfbaselines shows during training.
         """
+        self._pairs = []
         for _ in metrics:
             pass
         pairs, self._pairs = self._pairs, []

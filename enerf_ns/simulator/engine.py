@@ -270,7 +270,9 @@ class _Recorder:
 
     def add_frame(self, frame: Frame, source: Source) -> None:
         """Adds the next frame, with its depth if the source has depth."""
-        depth = source.depth(frame.time) if isinstance(source, RenderedScene | TrainedRun) else None
+        depth = None
+        if isinstance(source, RenderedScene) or (isinstance(source, TrainedRun) and source.has_depth):
+            depth = source.depth(frame.time)
         shown, seed = self._settings.frame, self._settings.sensor.seed
         sharp = develop(frame.sharp, shown, frame.number, False, seed)
         blurred = None if frame.blurred is None else develop(frame.blurred, shown, frame.number, True, seed)

@@ -24,6 +24,7 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.runs import load_any_method
 from enerf_ns.sensor.response import Logarithm, Response
+from enerf_ns.simulator.trajectories import POSES_PER_SECOND, sampled
 
 if TYPE_CHECKING:
     from enerf_ns.simulator.scene.render import Renderer
@@ -32,6 +33,9 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", "
 
 FRAMES_KEPT = 8
 """Number of decoded frames of a video that are kept, since threads do not ask for frames strictly in order."""
+
+CHUNK_ON_CPU = 1024
+"""Most rays of a trained run that a CPU renders at once."""
 
 SHARE_DECODED = 0.9
 """Least fraction of the stated frames of a video that must be decoded. With fewer, the end of the video is missing; the
@@ -273,6 +277,7 @@ class TrainedRun:
 
     Attributes:
         camera: The event camera without its distortion, or the first camera of the training; may be replaced.
+        has_depth: Whether the depth has a meaning, which that of a panorama has not.
 
     Raises:
         RecordingError: The file is missing, Nerfstudio cannot load the run, or it has fewer than two cameras to move
@@ -280,12 +285,22 @@ class TrainedRun:
     """
 
     def __init__(self, config: Path, trajectory: Trajectory | None = None, duration: int = 10**9):
+        # These import Nerfstudio, which other sources do without.
+        from enerf_ns.dataparsers.event_dataparser import go_on_without_lpips
+        from enerf_ns.kernels.fast_hash_encoding import speed_up_hash_grids
+
+        go_on_without_lpips()
         pipeline: Any = load_any_method(config, "inference")[1]
         from nerfstudio.models.splatfacto import SplatfactoModel
 
         self.config = config
         self._model, self._lock = pipeline.model, Lock()
+        speed_up_hash_grids(self._model)
+        if self._model.device.type == "cpu":  # what larger chunks compute does not fit its cache
+            settings = self._model.config
+            settings.eval_num_rays_per_chunk = min(settings.eval_num_rays_per_chunk, CHUNK_ON_CPU)
         self._renders_z_depth = isinstance(self._model, SplatfactoModel)
+        self.has_depth = not getattr(self._model.config, "panorama", False)
         outputs = pipeline.datamanager.train_dataparser_outputs
         transform = outputs.metadata.get("transform", outputs.dataparser_transform)
         self._transform = transform[:3].double().numpy()
@@ -323,6 +338,8 @@ class TrainedRun:
         from nerfstudio.cameras.cameras import Cameras
         from nerfstudio.models.base_model import Model
 
+        from enerf_ns.method.model import EnerfModel
+
         rotation, shift = self._transform[:, :3], self._transform[:, 3]
         pose = rotation @ _pose(self.trajectory, time)
         pose[:, 3] = self._scale * (pose[:, 3] + shift)
@@ -335,12 +352,16 @@ class TrainedRun:
             width=self.camera.width,
             height=self.camera.height,
         ).to(self._model.device)
-        casts_rays = type(self._model).get_outputs_for_camera is Model.get_outputs_for_camera
+        renders = type(self._model).get_outputs_for_camera
+        casts_rays = renders in (Model.get_outputs_for_camera, EnerfModel.get_outputs_for_camera)
         with self._lock:
-            if pixels is not None and casts_rays:
-                row, column = np.divmod(pixels, self.camera.width)
-                places = torch.from_numpy(np.stack([row, column], axis=-1)[:, None] + 0.5).float()
-                rays = camera.generate_rays(camera_indices=0, coords=places.to(self._model.device))
+            if casts_rays:
+                places = None
+                if pixels is not None:
+                    row, column = np.divmod(pixels, self.camera.width)
+                    places = torch.from_numpy(np.stack([row, column], axis=-1)[:, None] + 0.5).float()
+                    places = places.to(self._model.device)
+                rays = camera.generate_rays(camera_indices=0, coords=places, keep_shape=True)
                 outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
             else:
                 outputs = self._model.get_outputs_for_camera(camera)
@@ -360,7 +381,8 @@ class TrainedRun:
         back = np.linalg.inv(self._transform[:, :3])
         positions = (poses[:, :, 3] / self._scale - self._transform[:, 3]) @ back.T
         times = np.linspace(0, duration, len(poses)).astype(np.int64)
-        return Trajectory(times, positions, Rotation.from_matrix(back @ poses[:, :, :3]).as_quat())
+        past = Trajectory(times, positions, Rotation.from_matrix(back @ poses[:, :, :3]).as_quat())
+        return sampled(past, POSES_PER_SECOND) if duration > len(poses) * 10**9 // POSES_PER_SECOND else past
 
 
 def linear_from_srgb(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -66,4 +66,7 @@ def test_other_programs_read_the_file(content: bytes, tmp_path: Path):
     read = reader.read_point_cloud(str(tmp_path / "splats.ply"))
     splats = parsed(content)
     np.testing.assert_allclose(read.point.positions.numpy(), np.stack([splats[axis] for axis in "xyz"], 1), atol=1e-6)
-    assert np.allclose(1 / (1 + np.exp(-splats["opacity"])), OPACITY) and (splats["rot_0"] == 1).all()
+    assert np.allclose(1 / (1 + np.exp(-splats["opacity"])), OPACITY)
+    turned = np.stack([splats[f"rot_{i}"] for i in range(4)], 1)
+    assert (turned == [1, 0, 0, 0]).all()  # w x y z
+    assert (splats["scale_0"] == splats["scale_1"]).all() and (splats["scale_0"] == splats["scale_2"]).all()

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import torchvision
 from recordings import write_esim
 from scipy.spatial.transform import Rotation
 
@@ -346,11 +347,12 @@ def test_a_run_of_this_package_is_rendered_as_its_own_evaluation_does(tmp_path: 
 
 @pytest.mark.slow
 def test_a_run_of_another_method_is_rendered_past_its_cameras(tmp_path: Path, monkeypatch):
-    """In the world of its data, whatever Nerfstudio turned, moved and scaled it by."""
+    """In the world of its data, whatever Nerfstudio turned, moved and scaled it by; without the weights of LPIPS."""
     from nerfstudio.utils.eval_utils import eval_setup
 
     perceptual_metric = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
-    monkeypatch.setattr(perceptual_metric, lambda **_: torch.nn.Identity())  # it would download its weights
+    no_weights = (tmp_path / "alexnet.pth").as_uri()
+    monkeypatch.setattr(torchvision.models.AlexNet_Weights.DEFAULT.value, "url", no_weights)
     write_pictures(tmp_path / "data")
     eyes = np.array([3.0, -2.0, 5.0]) + np.random.default_rng(0).normal(size=(NUM_PICTURES, 3))
     looks = look_at(eyes, np.array([2.0, 9.0, 4.0]))
@@ -361,11 +363,14 @@ def test_a_run_of_another_method_is_rendered_past_its_cameras(tmp_path: Path, mo
         frames.append({"file_path": f"frame{index}.png", "transform_matrix": matrix.tolist()})
     camera = {"w": WIDTH, "h": HEIGHT, "fl_x": 30.0, "fl_y": 31.0, "cx": 12.5, "cy": 8.0, "camera_model": "OPENCV"}
     (tmp_path / "data/transforms.json").write_text(json.dumps({**camera, "frames": frames}))
-    config = train(
-        *(monkeypatch, tmp_path, "nerfacto", "--pipeline.model.implementation", "torch"),
-        *("--pipeline.model.log2-hashmap-size", 12, "--pipeline.datamanager.train-num-rays-per-batch", 64),
-        *("nerfstudio-data", "--data", "data", "--eval-mode", "all"),
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr(perceptual_metric, lambda **_: torch.nn.Identity())  # it would download its weights
+        config = train(
+            *(patch, tmp_path, "nerfacto", "--pipeline.model.implementation", "torch"),
+            *("--pipeline.model.log2-hashmap-size", 12, "--pipeline.datamanager.train-num-rays-per-batch", 64),
+            *("nerfstudio-data", "--data", "data", "--eval-mode", "all"),
+        )
+    monkeypatch.chdir(tmp_path)
     run = TrainedRun(config, duration=11 * 10**6)
     assert (run.camera.width, run.camera.height, run.start, run.end) == (WIDTH, HEIGHT, 0, 11 * 10**6)
     assert (run.camera.fx, run.camera.fy, run.camera.cx, run.camera.cy) == (30.0, 31.0, 12.0, 7.5)
@@ -379,3 +384,6 @@ def test_a_run_of_another_method_is_rendered_past_its_cameras(tmp_path: Path, mo
         expected = linear_from_srgb(rendered["rgb"].numpy())
         np.testing.assert_allclose(run.brightness(index * 10**6), expected, atol=1e-3)
         assert (run.depth(index * 10**6) * outputs.dataparser_scale <= rendered["depth"][..., 0].numpy() + 1e-3).all()
+    slow = TrainedRun(config, duration=11 * 10**8).trajectory
+    assert np.diff(slow.times).max() == 10**6  # the recording has poses that are close enough to be interpolated
+    np.testing.assert_allclose(slow.poses(torch.tensor([3 * 10**8])), run.trajectory.poses(torch.tensor([3 * 10**6])))

@@ -166,7 +166,8 @@ class SceneView(ViewerControl):
     def _look(self) -> Tensor:
         """Depth of the first view of the current field, scene units. Also measures the brightness of that view."""
         model, was_training = self._model, self._model.training
-        outputs = model.eval().get_outputs_for_camera(self._look_camera)
+        rays = self._look_camera.generate_rays(camera_indices=0, keep_shape=True)
+        outputs = model.eval().get_outputs_for_camera_ray_bundle(rays)
         model.train(was_training)
         if self._manager.config.supervision == "events":  # which do not determine the level of brightness
             self._level = float(np.log2(MIDDLE_BRIGHTNESS / outputs["rgb"].median().clamp(min=1e-6).cpu()))
