@@ -1,13 +1,17 @@
-"""Plot of the PSNR of the rows of an experiment against their training time, with the Pareto front."""
+"""Plot of the PSNR of the rows of an experiment against their training time, with the Pareto front.
+
+Rows that differ in their budget alone are one curve. Its band is the standard deviation of the seeds.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
 from enerf_ns.bench.tables import Line, Results, lines
-from enerf_ns.report.figures import GREY, WIDTH, plain, style
+from enerf_ns.report.figures import GREY, WIDTH, logarithmic, plain, style
 from enerf_ns.report.trade_offs import pareto_front
 
 if TYPE_CHECKING:
@@ -39,17 +43,33 @@ def diagram(results: Results) -> bytes | None:
 
 
 def _plot(axis: Axes, found: list[Line]) -> None:
-    means = [(mean(line.seconds), mean(line.scores["psnr"])) for line in found]
-    for number, (line, (seconds, psnr)) in enumerate(zip(found, means, strict=True)):
-        spread = {
-            "xerr": stdev(line.seconds) if len(line.seconds) > 1 else None,
-            "yerr": stdev(line.scores["psnr"]) if len(line.scores["psnr"]) > 1 else None,
-        }
-        look = style(number) | {"linestyle": "none", "markersize": 8, "markeredgecolor": "black"}
-        axis.errorbar(seconds, psnr, **spread, **look, elinewidth=0.8, capsize=2, label=line.row)
-    best = pareto_front([(seconds, -psnr) for seconds, psnr in means])
-    front = sorted(point for point, is_best in zip(means, best, strict=True) if is_best)
+    """Draws each row as a point, and joins the rows of one way to train by a line with a band."""
+    points = [(mean(line.seconds), mean(line.scores["psnr"])) for line in found]
+    curves: dict[str, list[int]] = {}
+    for number, line in enumerate(found):
+        curves.setdefault(way_to_train(line.row), []).append(number)
+    for place, (name, numbers) in enumerate(curves.items()):
+        ordered = sorted(numbers, key=lambda number: points[number])
+        seconds, psnr = ([points[number][axis_of] for number in ordered] for axis_of in (0, 1))
+        off = [stdev(scores) if len(scores := found[number].scores["psnr"]) > 1 else 0.0 for number in ordered]
+        wide = [stdev(found[number].seconds) if len(found[number].seconds) > 1 else 0.0 for number in ordered]
+        look = style(place) | {"markersize": 8, "markeredgecolor": "black"}
+        if len(numbers) > 1:
+            low, high = ([value + sign * each for value, each in zip(psnr, off, strict=True)] for sign in (-1, 1))
+            axis.fill_between(seconds, low, high, color=look["color"], alpha=0.2, linewidth=0)
+        else:
+            look["linestyle"] = "none"
+        axis.errorbar(seconds, psnr, xerr=wide, yerr=off, **look, elinewidth=0.8, capsize=2, label=name)
+    if len(curves) < len(found):
+        logarithmic(axis, "x", [seconds for seconds, _ in points])
+    best = pareto_front([(seconds, -psnr) for seconds, psnr in points])
+    front = sorted(point for point, is_best in zip(points, best, strict=True) if is_best)
     axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1, label="Pareto front")
     axis.set(xlabel="training, s", ylabel="PSNR, dB")
     plain(axis)
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8)
+
+
+def way_to_train(row: str) -> str:
+    """The name of a row without the factor of its budget, such as events for events-2x."""
+    return re.sub(r"-\d+(\.\d+)?x$", "", row)

@@ -28,6 +28,8 @@ class Row:
     """How the training frames are reconstructed from events. None: the recording's own frames are used."""
     known_sensor: bool = False
     """Whether the row gets the parameters of the simulated sensor."""
+    budget: float = 1.0
+    """Factor of the training time, or of the number of steps, of --budget."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from enerf_ns.bench import published
@@ -97,6 +97,16 @@ def known_sensor(sensor: SensorSettings) -> dict[str, Any]:
     }
 
 
+LEVELLING = ("nerf-blurred", "deblur", "events", "events+blurred")
+"""Rows whose budget is varied."""
+
+BUDGETS = (0.25, 0.5, 1, 2)
+
+USLAM: dict[str, Any] = {PARSER + "format": "llff_events", PARSER + "options": {"pose_set": "uslam"}}
+"""Reads the poses of Ultimate-SLAM that come with Gen3-HandHeld."""
+
+POSES_AS_READ = {f"pipeline.poses.refine_{part}": False for part in ("clock", "mount", "lens", "drift")}
+
 ROWS: dict[str, Row] = {
     "nerf-sharp": Row({**FRAMES, **SHARP}),
     "nerf-blurred": Row({**FRAMES, **ONE_INSTANT}),
@@ -105,6 +115,8 @@ ROWS: dict[str, Row] = {
     "filter": Row({**FRAMES, **ONE_INSTANT}, reconstruction="filter"),
     "events": Row(),
     "events+blurred": Row(EVENTS_AND_FRAMES),
+    "uslam-poses": Row({**EVENTS_AND_FRAMES, **USLAM}),
+    "uslam-poses-as-read": Row({**EVENTS_AND_FRAMES, **USLAM, **POSES_AS_READ}),
     "events+blurred-one-instant": Row({**EVENTS_AND_FRAMES, **ONE_INSTANT}),
     "paper-loss": Row(PAPER_LOSS),
     "normalised-loss": Row({**PAPER_LOSS, MODEL + "event_loss": "normalised"}),
@@ -149,6 +161,10 @@ ROWS: dict[str, Row] = {
     "known": Row(known_sensor=True),
 }
 """Rows by name. Experiments with the same row share its runs."""
+
+ROWS |= {
+    f"{name}-{budget:g}x": replace(ROWS[name], budget=budget) for name in LEVELLING for budget in BUDGETS if budget != 1
+}
 
 NEAR = (0.9, 2.6)
 """Range of depth of the near objects of the unbounded scene, metres."""
@@ -208,6 +224,9 @@ EV_DEBLUR_BLENDER = ("blurfactory", "bluroutdoorpool", "blurtanabata", "blurwine
 EV_DEBLUR_CDAVIS = ("blurbatteries", "blurdrones", "blurequipment", "blurfigures", "blurpowersupplies")
 """Scenes in the configs of Ev-DeblurNeRF's authors."""
 
+GEN3_HANDHELD = tuple(f"{exposure}ms/speed{speed}" for exposure in (10, 30, 50) for speed in (1, 2, 3))
+"""Scenes in the configs of Gen3-HandHeld's authors, by the exposure of their frames."""
+
 SEQUENCES: dict[str, Sequence] = {
     **{name: Sequence(name, preset=name) for name in FIVE},
     "spiral1-sparse": Sequence("spiral1", preset="spiral1-sparse"),
@@ -242,7 +261,10 @@ SEQUENCES: dict[str, Sequence] = {
         if name != published.MEAN
     },
     **{name: Sequence(changes={SENSOR + "contrast_thresholds": (0.2, 0.2)}) for name in EV_DEBLUR_BLENDER},
-    **{name: Sequence(changes={SENSOR + "contrast_thresholds": (0.25, 0.25)}) for name in EV_DEBLUR_CDAVIS},
+    **{
+        name: Sequence(changes={SENSOR + "contrast_thresholds": (0.25, 0.25)})
+        for name in (*EV_DEBLUR_CDAVIS, *GEN3_HANDHELD)
+    },
     "mocap-1d-trans": Sequence(preset="mocap-1d-trans"),
     "mocap-desk2": Sequence(preset="mocap-desk2"),
     "mocap-desk2-6views": Sequence(preset="mocap-desk2-6views"),
@@ -334,6 +356,20 @@ EXPERIMENTS: dict[str, Experiment] = {
         columns=("depth_rmse_all_poses",),
         published=published.DEPTH,
     ),
+    "full-size": Experiment(
+        "Frames, events, and both, at the size of the paper (--scale 1).",
+        ("nerf-blurred", "events", "events+blurred"),
+        tuple(published.FULL_SIZE),
+        columns=(*published.PSNR_SSIM_LPIPS, "depth_rmse_all_poses"),
+        published=published.FULL_SIZE,
+        notes=OF_BASELINES[:1] + OF_BASELINES[3:],
+    ),
+    "levelling": Experiment(
+        "The budget, from a quarter to twice --budget, to find out where quality levels off.",
+        tuple(f"{name}-{budget:g}x".removesuffix("-1x") for name in LEVELLING for budget in BUDGETS),
+        ("shake-moon2", "shake-carpet1"),
+        notes=("Learning rates fall to the end of each training, so that each row is a training of its own.",),
+    ),
     "run-time": Experiment(
         "Time of a training step, and the share of each part in percent.",
         ("nerf-blurred", "events", "events+blurred", "events-30096-pairs"),
@@ -423,6 +459,18 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=published.EV_DEBLUR_CDAVIS,
         source="Ev-DeblurNeRF and DiET-GS",
         notes=OF_EV_DEBLUR,
+    ),
+    "gen3-handheld": Experiment(
+        "Gen3-HandHeld (folders in --data), with poses of motion capture, and with noisy ones that are refined or not.",
+        ("events+blurred", "uslam-poses", "uslam-poses-as-read"),
+        recorded=GEN3_HANDHELD,
+        protocols=("raw", "log-affine-set"),
+        notes=(
+            "All sharp pictures are held out, with poses of motion capture. uslam-poses has those of Ultimate-SLAM, on "
+            "which the publication (Zou et al., T-RO 2026) trains, and as-read does not refine them.",
+            "The publication's scores are not known here. It aligns the held-out poses with the trained field before "
+            "it scores; here they stay as they are.",
+        ),
     ),
     "validation": Experiment(
         "Different recordings on which changes of defaults are chosen and checked.",

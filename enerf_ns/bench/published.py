@@ -102,6 +102,12 @@ DEPTH = _table(
 )
 """E-NeRF, root mean square error of depth in metres, over all train and test poses."""
 
+FULL_SIZE: Published = {
+    sequence: {row: {**scores, **DEPTH[sequence].get(row, {})} for row, scores in (SPIRAL | SHAKE)[sequence].items()}
+    for sequence in ("shake-carpet1", "shake-moon2", "spiral1")
+}
+"""E-NeRF, scores and depth of three sequences."""
+
 RUN_TIME: Published = {
     "spiral1": {
         "nerf-blurred": {"ms_a_step": 210.0},

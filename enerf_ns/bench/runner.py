@@ -226,7 +226,7 @@ class Bench:
             "recording": recording_digest(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
             "reconstruction": row.reconstruction,
             "weights": weights and hashlib.sha256(expanded(weights).read_bytes()).hexdigest(),
-            "budget": settings.budget,
+            "budget": self._budget(cell),
             "protocols": self.experiment.protocols,
             "vgg": "lpips_vgg" in self.experiment.columns,
             "parts": self.experiment.parts,
@@ -235,6 +235,14 @@ class Bench:
             "device": device_name(),
         }
         return json.loads(json.dumps(about))
+
+    def _budget(self, cell: Cell) -> str:
+        """The budget of a row, in the unit of --budget."""
+        budget, factor = self.settings.budget, ROWS[cell.row].budget
+        amount, in_seconds = parse_budget(budget)
+        if factor == 1:
+            return budget
+        return f"{factor * amount:.3f}s" if in_seconds else str(max(1, round(factor * amount)))
 
     def folder(self, cell: Cell) -> Path:
         """Folder of the run of a cell, in the layout of Nerfstudio."""
@@ -272,7 +280,7 @@ class Bench:
     def _trained(self, cell: Cell, folder: Path) -> dict[str, Any]:
         """Trains a cell in a folder, and returns its seconds, steps and scores."""
         config = self._config(cell, folder)
-        config.max_num_iterations = steps_of(self.settings.budget, config)
+        config.max_num_iterations = steps_of(self._budget(cell), config)
         run = train(config)
         assert run.train_seconds is not None and run.processor_seconds is not None
         columns = self.experiment.columns

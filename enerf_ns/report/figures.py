@@ -101,7 +101,7 @@ def error_against(axis_of: Literal["seconds", "step"], runs: Sequence[Curve]) ->
         axis.set_ylabel(SCORES[name])
         axis.margins(y=0.15)
         plain(axis)
-    _logarithmic(axes[-1], "x", [getattr(row, axis_of) for row in drawn])
+    logarithmic(axes[-1], "x", [getattr(row, axis_of) for row in drawn])
     axes[-1].set_xlabel("training time, s (log)" if axis_of == "seconds" else "training steps (log)")
     few = {row.num_frames for row in drawn if not row.final and row.num_frames}
     over = f"{min(few)} held-out frames, " if len(few) == 1 else "a few held-out frames, " if few else ""
@@ -145,14 +145,14 @@ def work_precision(runs: Sequence[Curve]) -> Figure | None:
         axis.set_ylabel(f"{label} (log)")
         axis.margins(0.12)
         plain(axis)
-        _logarithmic(axis, "y", [cost[1] for cost in costs])
+        logarithmic(axis, "y", [cost[1] for cost in costs])
         if name == "psnr":
             decibels = axis.secondary_yaxis("right", functions=(psnr_of, rms_error))
             decibels.set_ylabel("PSNR, dB")
             decibels.yaxis.set_major_locator(MaxNLocator(6))
             decibels.yaxis.set_major_formatter(ScalarFormatter())
             decibels.yaxis.set_minor_locator(NullLocator())
-    _logarithmic(axes[-1], "x", [run.seconds for run in runs if run.seconds])
+    logarithmic(axes[-1], "x", [run.seconds for run in runs if run.seconds])
     axes[-1].set_xlabel("training time, s (log)")
     marks = [("o", GREY, 12, "none", "on the Pareto front: no other run is both faster and better")]
     if not all(run.over_all_frames for run in runs):
@@ -217,7 +217,7 @@ def _legend(axis: Axes, runs: Sequence[Curve], marks: Sequence[tuple[str, str, i
     axis.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, fontsize=8)
 
 
-def _logarithmic(axes: Axes, which: Literal["x", "y"], values: Sequence[float]) -> None:
+def logarithmic(axes: Axes, which: Literal["x", "y"], values: Sequence[float]) -> None:
     """Makes an axis logarithmic with plain numbers, even if the values span less than a factor of 4."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from test_bench_tables import results, run
 
-from enerf_ns.bench.diagram import _plot, diagram
+from enerf_ns.bench.diagram import _plot, diagram, way_to_train
 from enerf_ns.bench.tables import lines
 
 FAST = [run("fast", psnr, seed=seed, seconds=1.0 + seed) for seed, psnr in enumerate((20.0, 22.0))]
@@ -27,6 +27,26 @@ def test_rows_lie_at_their_means_and_what_is_slower_and_worse_is_behind_the_fron
     assert front.get_xydata().tolist() == [[1.5, 21.0], [6.0, 27.0]]
     upper = axis.containers[1].lines[1][-1].get_ydata()
     assert float(np.max(upper)) == pytest.approx(27.0 + np.std([25.0, 29.0], ddof=1))
+
+
+def test_rows_that_differ_in_their_budget_alone_are_one_curve_whose_band_is_the_spread_of_the_seeds():
+    axis: Any = Figure().subplots()
+    longer = [
+        each | {"row": "fast-2.5x", "seconds": 3.0, "scores": SLOW[seed]["scores"]} for seed, each in enumerate(FAST)
+    ]
+    _plot(axis, lines(results(*longer, *FAST, *BEHIND, published={})))
+    curve, point = axis.containers
+    assert (curve.get_label(), point.get_label()) == ("fast", "behind")
+    assert curve.lines[0].get_xydata().tolist() == [[1.5, 21.0], [3.0, 27.0]]
+    (band,) = axis.collections[:1]
+    low, high = np.std([20.0, 22.0], ddof=1), np.std([25.0, 29.0], ddof=1)
+    for expected in ((1.5, 21.0 - low), (1.5, 21.0 + low), (3.0, 27.0 - high), (3.0, 27.0 + high)):
+        assert np.abs(band.get_paths()[0].vertices - expected).max(axis=1).min() < 1e-9
+
+
+@pytest.mark.parametrize(("row", "name"), [("events-0.5x", "events"), ("resolution-x12", "resolution-x12")])
+def test_a_way_to_train_is_a_row_without_its_budget(row: str, name: str):
+    assert way_to_train(row) == name
 
 
 def test_a_plot_for_each_sequence_that_has_two_rows():

@@ -221,6 +221,18 @@ def test_experiments_share_the_runs_of_rows_and_sequences_that_they_share():
     assert len(folders("ablation") & shared) == 5
 
 
+@pytest.mark.parametrize(
+    ("budget", "expected"),
+    [("1002", ["250", "501", "1002", "2004"]), ("1.5s", ["0.375s", "0.750s", "1.5s", "3.000s"])],
+)
+def test_rows_of_several_budgets_share_the_run_of_the_budget_itself(budget: str, expected: list[str]):
+    run = Bench("levelling", BenchSettings(budget=budget, rows=("events-0.25x", "events-0.5x", "events", "events-2x")))
+    cells = [cell for cell in run.cells if cell.sequence == "shake-moon2"]
+    assert [run._about(cell)["budget"] for cell in cells] == expected
+    shake = Bench("shake", BenchSettings(budget=budget, rows=("events",), sequences=("shake-moon2",)))
+    assert {shake.folder(cell) for cell in shake.cells} < {run.folder(cell) for cell in cells}
+
+
 def test_all_rows_on_a_recording_have_one_field_though_their_preset_leaves_gloss_open():
     run = Bench("spiral", BenchSettings(method="enerf"))
     for cell in run.cells:
