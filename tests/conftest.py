@@ -4,6 +4,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -75,6 +76,16 @@ def not_drawn(items: list[pytest.Item], seed: int) -> set[pytest.Item]:
 def cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Indices of events go to a folder of this test run, also those of the commands that tests call."""
     os.environ["ENERF_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(autouse=True)
+def logs_of_its_own() -> Iterator[None]:
+    """Trainings of this test write to no log of a test before, whose folder may be gone."""
+    yield
+    if "nerfstudio.utils.writer" in sys.modules:
+        from enerf_ns.method.nerfstudio_seams import start_new_logs
+
+        start_new_logs()
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from nerfstudio.scripts.train import _set_random_seed
-from nerfstudio.utils import writer
 
 from enerf_ns.method.config import enerf
 from enerf_ns.method.trainer import EnerfTrainerConfig
@@ -44,7 +43,6 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
 def set_up(config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1) -> Any:
     """A trainer as `ns-train` makes it, set up."""
     _set_random_seed(config.machine.seed)
-    writer.EVENT_WRITERS.clear()  # of the run before, whose folder may be gone
     config.save_config()
     trainer = config.setup(local_rank=local_rank, world_size=world_size)
     trainer.setup()

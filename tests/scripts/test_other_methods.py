@@ -73,9 +73,7 @@ def nerfacto(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def train(method: str, data: Path, patch: pytest.MonkeyPatch) -> Path:
     """config.yml of a run of a few steps in the working directory."""
     from nerfstudio.scripts.train import entrypoint
-    from nerfstudio.utils import writer
 
-    writer.EVENT_WRITERS.clear()  # of the run before
     output = ["--output-dir", Path("outputs").resolve()]
     arguments = ["ns-train", method, "--data", data, *output, *STEPS, *METHODS[method], "event-data"]
     patch.setattr("sys.argv", [*map(str, arguments)])
