@@ -1,4 +1,5 @@
 # make demo    set up, then simulate events, train on them, evaluate and render: outputs/demo/
+# make release-run   the demo, its run and its recording packed as the file of a release: outputs/demo.zip
 # make test    set up, then run every check and every test, of long sweeps a part;   make test-all   those in full
 # make docs    set up, then write the pages as a site: build/docs/index.html (Python 3.11 or later)
 # make results train and score every table of the pages, which takes many hours, and put them there;
@@ -12,10 +13,13 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.10 python3; do \
 # The name of the stamp changes with what it depends on, so that an unchanged set-up costs nothing, a fresh checkout included.
 STAMP := .venv/set-up-$(shell cat pyproject.toml constraints.txt | cksum | cut -d' ' -f1)
 
-.PHONY: demo test test-all results docs lint format clean
+.PHONY: demo release-run test test-all results docs lint format clean
 
 demo: $(STAMP)
 	.venv/bin/enerf demo --output-dir outputs/demo
+
+release-run: demo
+	.venv/bin/enerf export run "$$(ls -d outputs/demo/runs/recording/enerf/*/ | tail -n 1)" --output outputs/demo.zip
 
 test: lint
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/pytest --slow -n 2 --dist worksteal
