@@ -292,6 +292,24 @@ def errors(true: Any, other: Any) -> tuple[float, float]:
     return 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((left**2).sum(axis=1).mean())))
 
 
+def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int = 1000) -> str:
+    """PSNR and correlation of each fault on each recording after as many steps, fixed and refined, as Markdown."""
+
+    def cell(recording: str, fault: str, row: str) -> str:
+        wanted = recording, fault, row, steps
+        runs = [one for one in results if (one["recording"], one["fault"], one["row"], one["steps"]) == wanted]
+        psnr, correlation = ([one[key] for one in runs] for key in ("psnr", "event_correlation"))
+        spread = f" ± {np.std(psnr, ddof=1):.2f}" if len(runs) > 1 else ""
+        return f"{np.mean(psnr):.2f}{spread}, {np.mean(correlation):.2f}" if runs else "-"
+
+    head = ["wrong", *(cell for name in recordings for cell in (f"`{name}` fixed", "refined"))]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for fault in faults:
+        cells = [cell(recording, fault, row) for recording in recordings for row in COMPARED]
+        lines.append(f"| {' | '.join([fault, *cells])} |")
+    return "\n".join(lines)
+
+
 def table(results: list[dict[str, Any]]) -> str:
     """Means over the seeds, a line for each recording and fault."""
     cells: dict[tuple[str, str], dict[str, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image, ImageDraw
+from pose_refinement import scores_by_fault
 
 from enerf_ns.bench.measures import VIEW
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS
@@ -32,40 +33,45 @@ from enerf_ns.report.tables import Table
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 FIGURES = ROOT / "docs" / "figures"
-PAGES = (ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "docs" / "results.md")
+PAGES = (ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 SEEDS = 3
 OF_THE_PAPER = ("nerf-sharp", "nerf-blurred", "deblur", "e2vid", "events", "events+blurred")
 
 PLAN: dict[str, dict[str, Any]] = {
-    "shake": {"budget": "1000", "rows": OF_THE_PAPER},
-    "spiral": {"budget": "1000", "rows": OF_THE_PAPER},
-    "design": {"budget": "1000", "rows": ("nerf-blurred", "deblur", "events", "events+blurred")},
-    "slider-depth": {"budget": "1000"},
+    "shake": {"budget": "2000", "rows": OF_THE_PAPER},
+    "spiral": {"budget": "2000", "rows": OF_THE_PAPER},
+    "levelling": {"budget": "2000"},
+    "depth": {"budget": "2000", "rows": OF_THE_PAPER},
+    "design": {"budget": "2000", "rows": ("nerf-blurred", "deblur", "events", "events+blurred")},
+    "slider-depth": {"budget": "2000"},
     "run-time": {"budget": "100", "seeds": 1},
     "parts": {"budget": "600", "seeds": 1},
     "left-out": {"budget": "400"},
     "unbounded": {"budget": "400", "scale": 0.1875},
-    "ablation": {"budget": "1000"},
-    "encoding": {"budget": "1000"},
-    "views": {"budget": "1000"},
-    "no-event-weight": {"budget": "1000"},
-    "frame-weight": {"budget": "1000"},
-    "losses": {"budget": "1000"},
-    "sensor": {"budget": "1000"},
+    "ablation": {"budget": "2000"},
+    "encoding": {"budget": "2000"},
+    "views": {"budget": "2000"},
+    "no-event-weight": {"budget": "2000"},
+    "frame-weight": {"budget": "2000"},
+    "losses": {"budget": "2000"},
+    "sensor": {"budget": "2000"},
+    "full-size": {"budget": "8000", "scale": 1.0, "seeds": 1},
 }
 """Experiments in the order in which they are run, with the settings that differ from the defaults of `enerf bench`."""
 
 MARKED = re.compile(r"(<!-- enerf bench \S+: (\S+) -->\n).*?(<!-- end of \S+ -->)", re.DOTALL)
-SUMMARY = re.compile(r"(<!-- summary -->\n).*?(<!-- summary ends -->)", re.DOTALL)
+SCORES = re.compile(r"(<!-- scores of (.+?) on (.+?) -->\n).*?(<!-- scores end -->)", re.DOTALL)
+"""The mark of a small table: rows, then experiment/sequence or experiment/sequence/protocol, with spaces between."""
 
-SUMMARISED = {"shake": ("shake-moon2", "shake-carpet1"), "design": ("shapes",)}
-"""Sequences in the summary, by experiment."""
+REFINEMENT = re.compile(r"(<!-- pose refinement on (.+?) of (.+?) -->\n).*?(<!-- pose refinement ends -->)", re.DOTALL)
+"""The mark of the table of wrong poses: its recordings, and its faults, with spaces between."""
 
-ROWS_OF_SUMMARY = ("nerf-blurred", "events", "events+blurred")
+FIGURE_WIDTH = 1250
+"""Most pixels across a figure of held-out views."""
 
-VIEW_WIDTH = 160
-"""Width in pixels of a held-out view in a figure."""
+LABEL_WIDTH = 112
+"""Width in pixels of the names of the sequences beside the views."""
 
 
 def benches(arguments: argparse.Namespace, seeds: int) -> dict[str, Bench]:
@@ -88,19 +94,27 @@ def benches(arguments: argparse.Namespace, seeds: int) -> dict[str, Bench]:
     return found
 
 
-def summary() -> str:
-    """Scores of the main rows, from the committed result files."""
-    rows, about = [], set()
-    for name, sequences in SUMMARISED.items():
+def scores(rows: list[str], places: list[str]) -> str:
+    """A table of PSNR, SSIM and LPIPS from the committed result files, as the mark `SCORES` names its rows."""
+    lines, about = [], set()
+    for place in places:
+        name, sequence, *protocol = place.split("/")
         results = json.loads((RESULTS / f"{name}.json").read_text())
-        chosen = [run for run in results["runs"] if run["sequence"] in sequences and run["row"] in ROWS_OF_SUMMARY]
-        shown = {**results, "runs": chosen, "columns": PSNR_SSIM_LPIPS, "published": {}}
-        rows += scores_table(shown, bold=True).rows
-        about |= {(results["budget"], run["version"]) for run in chosen}
-    table = Table("", ["sequence", "learned from", "PSNR, dB", "SSIM", "LPIPS"], [row[:5] for row in rows])
+        runs = [run for run in results["runs"] if run["sequence"] == sequence and run["row"] in rows]
+        columns, protocols = PSNR_SSIM_LPIPS, protocol or results["protocols"][:1]
+        shown = {**results, "runs": runs, "columns": columns, "protocols": protocols, "published": {}}
+        lines += scores_table(shown, bold=True).rows
+        about |= {(results["budget"], run["version"]) for run in runs}
+    table = Table("", ["sequence", "learned from", "PSNR, dB", "SSIM", "LPIPS"], [line[:5] for line in lines])
     budgets, versions = ({one[place] for one in about} for place in (0, 1))
     steps, version = " or ".join(sorted(budgets)), " and ".join(sorted(versions))
     return f"{table.markdown()}\n\nEach training took {steps} steps on one CPU core, with version {version}."
+
+
+def refinement(recordings: list[str], faults: list[str]) -> str:
+    """The table of wrong poses from the committed trainings of benchmarks/pose_refinement.py."""
+    trained = (RESULTS / "pose-refinement.jsonl").read_text().splitlines()
+    return scores_by_fault([json.loads(line) for line in trained], recordings, faults)
 
 
 def views(bench: Bench) -> Image.Image:
@@ -108,56 +122,55 @@ def views(bench: Bench) -> Image.Image:
 
     A run leaves a picture of both (`VIEW`), so that a row without runs on this machine has no picture.
     """
-    header, label = 14, 90
-    sequences = {}
+    header, gap, label = 14, 2, LABEL_WIDTH
+    sequences: dict[str, dict[str, Image.Image]] = {}
     for cell in bench.cells:
         file = bench.folder(cell) / VIEW / "eval_img_0000.png"
         if cell.seed == 0 and file.exists():
             with Image.open(file) as both:
                 half = both.width // 2
-                height = round(both.height * VIEW_WIDTH / half)
-                frame, render = (
-                    both.crop((start, 0, start + half, both.height)).resize((VIEW_WIDTH, height)) for start in (0, half)
-                )
+                frame, render = (both.crop((start, 0, start + half, both.height)) for start in (0, half))
             sequences.setdefault(cell.sequence, {"frame": frame})[cell.row] = render
     columns = list(dict.fromkeys(name for pictures in sequences.values() for name in pictures))
-    heights = [max(picture.height for picture in pictures.values()) for pictures in sequences.values()]
-    figure = Image.new(
-        "RGB", (label + len(columns) * (VIEW_WIDTH + 2), header + sum(heights) + 2 * len(heights)), "white"
-    )
+    width = (FIGURE_WIDTH - label) // max(1, len(columns)) - gap
+    heights = [round(pictures["frame"].height * width / pictures["frame"].width) for pictures in sequences.values()]
+    size = (label + len(columns) * (width + gap), header + sum(heights) + gap * len(heights))
+    figure = Image.new("RGB", size, "white")
     draw, top = ImageDraw.Draw(figure), header
     for number, name in enumerate(columns):
-        draw.text((label + number * (VIEW_WIDTH + 2), 1), name, fill="black")
+        draw.text((label + number * (width + gap), 1), name, fill="black")
     for (sequence, pictures), height in zip(sequences.items(), heights, strict=True):
         draw.text((1, top + height // 2), sequence, fill="black")
         for number, name in enumerate(columns):
             if name in pictures:
-                figure.paste(pictures[name], (label + number * (VIEW_WIDTH + 2), top))
-        top += height + 2
+                figure.paste(pictures[name].resize((width, height)), (label + number * (width + gap), top))
+        top += height + gap
     return figure
 
 
 def write_figures(name: str, bench: Bench) -> None:
-    """Writes docs/figures/results-NAME.png, error against time, and results-NAME-views.png, where there are some."""
-    curve = bench.output_dir / f"{name}.png"
-    if curve.exists():
-        shutil.copy(curve, FIGURES / f"results-{name}.png")
-    figure = views(bench)
-    if figure.height > figure.width // 100:
-        figure.save(FIGURES / f"results-{name}-views.png", optimize=True)
+    """Writes docs/figures/results-NAME.png, error against time, and results-NAME-views.png, if a page shows them."""
+    shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    if f"results-{name}.png" in shown:
+        shutil.copy(bench.output_dir / f"{name}.png", FIGURES / f"results-{name}.png")
+    if f"results-{name}-views.png" in shown:
+        views(bench).quantize(256).save(FIGURES / f"results-{name}-views.png", optimize=True)
 
 
-def write_pages() -> None:
-    """Puts the tables of the committed result files between their marks on the pages."""
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
+def written(page: str) -> str:
+    """The text of a page with the tables of the committed result files between their marks."""
 
-        def table(found: re.Match[str]) -> str:
-            made = markdown(json.loads((ROOT / found[2]).read_text())).strip("\n")
-            return f"{found[1]}\n{made}\n\n{found[3]}"
+    def table(found: re.Match[str]) -> str:
+        made = markdown(json.loads((ROOT / found[2]).read_text())).strip("\n")
+        return f"{found[1]}\n{made}\n\n{found[3]}"
 
-        text = MARKED.sub(table, text)
-        write_whole(page, SUMMARY.sub(lambda found: f"{found[1]}{summary()}\n\n{found[2]}", text))
+    def small(found: re.Match[str]) -> str:
+        return f"{found[1]}\n{scores(found[2].split(), found[3].split())}\n\n{found[4]}"
+
+    def wrong_poses(found: re.Match[str]) -> str:
+        return f"{found[1]}\n{refinement(found[2].split(), found[3].split())}\n\n{found[4]}"
+
+    return REFINEMENT.sub(wrong_poses, SCORES.sub(small, MARKED.sub(table, page)))
 
 
 def main() -> None:
@@ -187,7 +200,8 @@ def main() -> None:
         for name, bench in passes[-1].items():
             shutil.copy(arguments.output_dir / f"{name}.json", RESULTS)
             write_figures(name, bench)
-        write_pages()
+        for page in PAGES:
+            write_whole(page, written(page.read_text(encoding="utf-8")))
 
 
 if __name__ == "__main__":
