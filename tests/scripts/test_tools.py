@@ -31,6 +31,7 @@ import test_eds
 import test_esim_npz
 import test_event_recording
 import test_eventnerf
+import test_fuzz
 import test_llff_events
 import test_tum_vie
 import torch
@@ -39,7 +40,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from warm_commands import WarmCommands
 
-from enerf_ns.dataparsers.formats.registry import formats
+from enerf_ns.dataparsers.formats.registry import format_named, formats
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.settings import SimulationSettings
@@ -132,6 +133,24 @@ RECORDINGS: dict[str, Callable[[Path], Path]] = {
     "event-recording": lambda folder: test_event_recording.write_recording(folder, ("frames",)),
 }
 
+LAYOUTS = (
+    *("esim", "esim_bag", "davis", "evimo2_left_camera", "mvsec", "vector", "ros_bag_1", "ros_bag_2"),
+    *("m3ed", "dsec", "e2nerf"),
+)
+"""Other layouts, in folders of these names."""
+
+
+def layout(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        folder = folder.with_name(name)
+        test_fuzz.LAYOUTS[name].write(folder)
+        return folder
+
+    return write
+
+
+RECORDINGS |= {f"{format_named(test_fuzz.LAYOUTS[name].format).command}, {name}": layout(name) for name in LAYOUTS}
+
 
 def make_opaque(config: Path) -> Path:
     """Raises the density of a run: a few steps make no surface, and `ns-export pointcloud` waits for one."""
@@ -172,6 +191,10 @@ def run_without_frames(home: Path, start) -> Path:
 def contents(folder: Path) -> dict[Path, str]:
     """Hashes of all files of a folder."""
     return {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_recording_of_every_format_trains_below():
+    assert {name.split(",")[0].split()[0] for name in RECORDINGS} == {format.command for format in formats()}
 
 
 @pytest.mark.sweep(1)
