@@ -32,6 +32,8 @@ NERFACTO = [
     *("--pipeline.model.num-levels", 4, "--pipeline.model.num-proposal-samples-per-ray", 8, 8),
     *("--pipeline.model.num-nerf-samples-per-ray", 8),
 ]
+WITHOUT_FRAMES = {"esim-npz", "esim-bag, esim_bag", "evimo2-events, evimo2_left_camera"}
+"""Recordings of events alone, the first with views for evaluation."""
 METHODS = {
     "nerfacto": NERFACTO,
     "depth-nerfacto": NERFACTO,
@@ -154,7 +156,7 @@ def test_render_videos(call: Callable[..., None], nerfacto: Path):  # noqa: F811
         assert abs(frame.shape[0] - HEIGHT) <= 1 and abs(frame.shape[1] - WIDTH) <= 1
 
 
-@pytest.mark.parametrize("name", sorted(RECORDINGS.keys() - {"esim-npz"}))  # which has views for evaluation alone
+@pytest.mark.parametrize("name", sorted(RECORDINGS.keys() - WITHOUT_FRAMES))
 def test_every_format_is_loaded_by_the_manager_of_splatfacto(tmp_path: Path, name: str):
     """Which hands whole pictures on; the rasterizer itself needs a GPU."""
     data = RECORDINGS[name](tmp_path / "recording")
@@ -167,8 +169,9 @@ def test_every_format_is_loaded_by_the_manager_of_splatfacto(tmp_path: Path, nam
     assert contents(data) == before
 
 
-def test_views_for_evaluation_alone_are_nothing_to_train_on(tmp_path: Path):
-    config = EventDataParserConfig(data=RECORDINGS["esim-npz"](tmp_path / "recording"))
+@pytest.mark.parametrize("name", sorted(WITHOUT_FRAMES))
+def test_events_and_views_for_evaluation_alone_are_nothing_to_train_on(tmp_path: Path, name: str):
+    config = EventDataParserConfig(data=RECORDINGS[name](tmp_path / "recording"), depth_range=(0.3, 4.0))
     with pytest.raises(SystemExit, match="holds no frames to train on"):
         config.setup().get_dataparser_outputs("train")
 
