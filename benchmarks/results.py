@@ -22,6 +22,7 @@ from typing import Any
 from PIL import Image, ImageDraw
 from pose_refinement import scores_by_fault
 
+from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.measures import VIEW
 from enerf_ns.bench.published import PSNR_SSIM_LPIPS
 from enerf_ns.bench.runner import Bench
@@ -152,7 +153,9 @@ def write_figures(name: str, bench: Bench) -> None:
     """Writes docs/figures/results-NAME.png, error against time, and results-NAME-views.png, if a page shows them."""
     shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     if f"results-{name}.png" in shown:
-        shutil.copy(bench.output_dir / f"{name}.png", FIGURES / f"results-{name}.png")
+        picture = diagram(json.loads((RESULTS / f"{name}.json").read_text()))
+        assert picture is not None
+        (FIGURES / f"results-{name}.png").write_bytes(picture)
     if f"results-{name}-views.png" in shown:
         views(bench).quantize(256).save(FIGURES / f"results-{name}-views.png", optimize=True)
 

@@ -10,7 +10,7 @@ import re
 from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
-from enerf_ns.bench.tables import Line, Results, lines
+from enerf_ns.bench.tables import Line, Results, lines, reference_row
 from enerf_ns.report.figures import GREY, WIDTH, logarithmic, plain, style
 from enerf_ns.report.trade_offs import pareto_front
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 def diagram(results: Results) -> bytes | None:
-    """A PNG with a plot for each sequence: PSNR against training time in seconds, as means and standard deviations
-    over seeds. None if no sequence has two rows with scores."""
+    """A PNG with a plot for each sequence: PSNR against training time, a ratio to that of `reference_row`, as means and
+    standard deviations over seeds. None if no sequence has two rows with scores."""
     from matplotlib.figure import Figure
 
     by_sequence: dict[str, list[Line]] = {}
     for line in lines(results):
-        if line.protocol == results["protocols"][0] and line.scores.get("psnr") and line.seconds:
+        if line.protocol == results["protocols"][0] and line.scores.get("psnr") and line.times:
             by_sequence.setdefault(line.sequence, []).append(line)
     compared = {name: found for name, found in by_sequence.items() if len(found) > 1}
     if not compared:
@@ -36,6 +36,7 @@ def diagram(results: Results) -> bytes | None:
         figure.subplots(len(compared), 1, squeeze=False)[:, 0], compared.items(), strict=True
     ):
         _plot(axis, found)
+        axis.set(xlabel=f"training time, {reference_row(results)} = 1", ylabel="PSNR, dB")
         axis.set_title(name, loc="left", fontsize=10)
     target = io.BytesIO()
     figure.savefig(target, format="png")
@@ -44,28 +45,27 @@ def diagram(results: Results) -> bytes | None:
 
 def _plot(axis: Axes, found: list[Line]) -> None:
     """Draws each row as a point, and joins the rows of one way to train by a line with a band."""
-    points = [(mean(line.seconds), mean(line.scores["psnr"])) for line in found]
+    points = [(mean(line.times), mean(line.scores["psnr"])) for line in found]
     curves: dict[str, list[int]] = {}
     for number, line in enumerate(found):
         curves.setdefault(way_to_train(line.row), []).append(number)
     for place, (name, numbers) in enumerate(curves.items()):
         ordered = sorted(numbers, key=lambda number: points[number])
-        seconds, psnr = ([points[number][axis_of] for number in ordered] for axis_of in (0, 1))
+        times, psnr = ([points[number][axis_of] for number in ordered] for axis_of in (0, 1))
         off = [stdev(scores) if len(scores := found[number].scores["psnr"]) > 1 else 0.0 for number in ordered]
-        wide = [stdev(found[number].seconds) if len(found[number].seconds) > 1 else 0.0 for number in ordered]
+        wide = [stdev(found[number].times) if len(found[number].times) > 1 else 0.0 for number in ordered]
         look = style(place) | {"markersize": 8, "markeredgecolor": "black"}
         if len(numbers) > 1:
             low, high = ([value + sign * each for value, each in zip(psnr, off, strict=True)] for sign in (-1, 1))
-            axis.fill_between(seconds, low, high, color=look["color"], alpha=0.2, linewidth=0)
+            axis.fill_between(times, low, high, color=look["color"], alpha=0.2, linewidth=0)
         else:
             look["linestyle"] = "none"
-        axis.errorbar(seconds, psnr, xerr=wide, yerr=off, **look, elinewidth=0.8, capsize=2, label=name)
+        axis.errorbar(times, psnr, xerr=wide, yerr=off, **look, elinewidth=0.8, capsize=2, label=name)
     if len(curves) < len(found):
-        logarithmic(axis, "x", [seconds for seconds, _ in points])
-    best = pareto_front([(seconds, -psnr) for seconds, psnr in points])
+        logarithmic(axis, "x", [time for time, _ in points])
+    best = pareto_front([(time, -psnr) for time, psnr in points])
     front = sorted(point for point, is_best in zip(points, best, strict=True) if is_best)
     axis.step(*zip(*front, strict=True), where="post", color=GREY, linewidth=1.2, zorder=1, label="Pareto front")
-    axis.set(xlabel="training, s", ylabel="PSNR, dB")
     plain(axis)
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8)
 

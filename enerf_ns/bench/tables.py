@@ -63,8 +63,9 @@ class Line:
     """Scores by name, one for each seed."""
     published: dict[str, float] = field(default_factory=dict)
     """Published scores by name."""
-    seconds: list[float] = field(default_factory=list)
-    """Training time of each run, s: that of the processor on a CPU."""
+    times: list[float] = field(default_factory=list)
+    """Training time, one for each seed: a ratio to that of `reference_row` on the same sequence with the same seed, so
+    that neither the machine nor its load counts."""
     steps: list[int] = field(default_factory=list)
     """Number of training steps of each run."""
 
@@ -74,6 +75,7 @@ def lines(results: Results) -> list[Line]:
     runs, published = results["runs"], results["published"]
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     rows = list(dict.fromkeys(run["row"] for run in runs))
+    of_reference = _reference_seconds(results)
     blocks = [] if results["mean"] else [[sequence] for sequence in sequences]
     if results["mean"] or MEAN in published:
         blocks.append(sequences)
@@ -85,20 +87,38 @@ def lines(results: Results) -> list[Line]:
         for row in rows:
             for place, protocol in enumerate(results["protocols"]):
                 line = Line(name, row, protocol, published=of_block.get(row, {}) if place == 0 else {})
-                _fill(line, [run for run in runs if run["row"] == row and run["sequence"] in block], len(block))
+                chosen = [run for run in runs if run["row"] == row and run["sequence"] in block]
+                _fill(line, chosen, len(block), of_reference)
                 found.append(line)
         others = [row for row in of_block if row not in rows]
         found += [Line(name, row, results["protocols"][0], published=of_block[row]) for row in others]
     return found
 
 
-def _fill(line: Line, runs: list[dict[str, Any]], num_sequences: int) -> None:
+def reference_row(results: Results) -> str:
+    """The row whose training time is the unit of the others: `events` if it is there, else the first one."""
+    rows = [run["row"] for run in results["runs"]]
+    return rows[0] if rows and "events" not in rows else "events"
+
+
+def _reference_seconds(results: Results) -> dict[tuple[str, int], float]:
+    """Training time in seconds of the reference row by sequence and seed, where it did not fail."""
+    runs = [run for run in results["runs"] if "failure" not in run]
+    row = reference_row(results)
+    return {(run["sequence"], run["seed"]): seconds_of(run) for run in runs if run["row"] == row}
+
+
+def _fill(
+    line: Line, runs: list[dict[str, Any]], num_sequences: int, of_reference: dict[tuple[str, int], float]
+) -> None:
     """Adds the mean scores over the sequences, for each seed that has all sequences."""
     for seed in dict.fromkeys(run["seed"] for run in runs):
         done = [run for run in runs if run["seed"] == seed and "failure" not in run]
         if len(done) < num_sequences:
             continue
-        line.seconds += [seconds_of(run) for run in done]
+        references = [of_reference.get((run["sequence"], run["seed"])) for run in done]
+        times = [seconds_of(run) / seconds for run, seconds in zip(done, references, strict=True) if seconds]
+        line.times += [mean(times)] if len(times) == num_sequences else []
         line.steps += [run["steps"] for run in done]
         scores = [run["scores"][line.protocol] for run in done]
         for name in scores[0]:
@@ -157,14 +177,14 @@ def scores_table(results: Results, bold: bool = False) -> Table:
     several = len(results["protocols"]) > 1
     source = results["source"]
     head = ["sequence", "row", *(["protocol"] if several else []), *map(_title, columns)]
-    head += ["training, s", "steps", *(f"{source}: {_title(name)}" for name in theirs)]
+    head += ["time", "steps", *(f"{source}: {_title(name)}" for name in theirs)]
     content = []
     for line in table:
         cells = [line.sequence, line.row, *([line.protocol] if several else [])]
         for name in columns:
             cell = _score(name, line.scores.get(name, [])) + _truth(name, line)
             cells.append(f"**{cell}**" if bold and _is_best(line, name, table) else cell)
-        cells += [f"{mean(line.seconds):.0f}" if line.seconds else NONE]
+        cells += [f"{mean(line.times):.2f}" if line.times else NONE]
         cells += [f"{mean(line.steps):.0f}" if line.steps else NONE]
         cells += [_published(name, line.published[name]) if name in line.published else NONE for name in theirs]
         content.append(cells)
@@ -250,8 +270,15 @@ def remarks(results: Results) -> Iterator[str]:
         )
     if len({run["version"] for run in runs}) > 1:
         yield "Rows come from more than one version of the code."
-    if any(run["device"] == "CPU" and "processor_seconds" in run for run in runs):
-        yield "Seconds are those of the processor in the training steps."
+    seconds = _reference_seconds(results).values()
+    if seconds:
+        of_processor = any(run["device"] == "CPU" and "processor_seconds" in run for run in runs)
+        low, high = (f"{edge(seconds):.0f}" for edge in (min, max))
+        span = low if low == high else f"{low} to {high}"
+        yield (
+            f"Time is that of the training steps{' on the processor' * of_processor}, divided by that of "
+            f"{reference_row(results)} on the same sequence with the same seed: {span} s."
+        )
     yield from results["notes"]
     if results["reconstruction_weights"] and any(run["row"] == "e2vid" for run in runs):
         yield f"e2vid reconstructs with the weights {results['reconstruction_weights']}."

@@ -56,8 +56,8 @@ def rows_of(table: str) -> list[list[str]]:
 def test_our_values_stand_beside_those_that_are_published():
     table = markdown(results(run("events", 25.128), run("frames", 21.0)))
     assert rows_of(table) == [
-        ["shake", "events", "**25.13**", "**0.500**", "2", "10", "30.00", "0.90"],
-        ["shake", "frames", "21.00", "**0.500**", "2", "10", "20.50", "0.40"],
+        ["shake", "events", "**25.13**", "**0.500**", "1.00", "10", "30.00", "0.90"],
+        ["shake", "frames", "21.00", "**0.500**", "1.00", "10", "20.50", "0.40"],
     ]
     assert table.startswith("    enerf bench made-up --budget 10\n") and "* A note.\n" in table
     assert "1 CPU thread; version 1.0" in table and "at scale 0.25" in table and "10 steps" in table
@@ -72,7 +72,7 @@ def test_means_over_sequences_are_of_the_seeds_that_have_all_sequences():
     runs = [run("events", 10.0 * seed + place, f"s{place}", seed) for seed in range(3) for place in (1, 3)]
     runs[-1] = {**runs[-1], "failure": "No room."}
     table = markdown(results(*runs, mean=True, published={"mean": {"events": {"psnr": 28.1, "ssim": 0.88}}}))
-    assert rows_of(table) == [["mean", "events", "7.00 ± 7.07", "0.500 ± 0.000", "2", "10", "28.10", "0.88"]]
+    assert rows_of(table) == [["mean", "events", "7.00 ± 7.07", "0.500 ± 0.000", "1.00", "10", "28.10", "0.88"]]
     assert "s3, events, seed 2 failed: No room." in table
 
 
@@ -106,6 +106,22 @@ def test_what_failed_and_what_is_left_out_say_why():
     assert rows_of(table)[1][:6] == ["shake", "frames", "-", "-", "-", "-"]
     assert "* shake, frames, seed 0 failed: The recording holds no frames.\n" in table
     assert "* e2vid is left out: no weights.\n" in table
+
+
+def test_time_is_a_ratio_to_events_of_the_same_seed_so_that_machines_may_differ():
+    seconds = {0: {"frames": 8.0, "events": 8.0}, 1: {"frames": 2.0, "events": 1.0}}
+    told = [
+        run(row, 21.0, seed=seed, processor_seconds=took) for seed, of in seconds.items() for row, took in of.items()
+    ]
+    table = markdown(results(*told))
+    assert {line[1]: line[4] for line in rows_of(table)} == {"frames": "1.50", "events": "1.00"}
+    assert "on the processor, divided by that of events on the same sequence with the same seed: 1 to 8 s." in table
+    without = results(
+        run("frames", 21.0), run("both", 25.0, seconds=1.0), run("gone", None, failure="No room."), published={}
+    )
+    assert {line[1]: line[4] for line in rows_of(markdown(without))} == {"frames": "1.00", "both": "0.50", "gone": "-"}
+    failed = results(run("frames", 21.0), run("events", None, failure="No room."))
+    assert [line[4] for line in rows_of(markdown(failed))][:2] == ["-", "-"]
 
 
 def test_a_score_that_a_run_has_not_is_a_dash():

@@ -13,34 +13,42 @@ from test_bench_tables import results, run
 from enerf_ns.bench.diagram import _plot, diagram, way_to_train
 from enerf_ns.bench.tables import lines
 
-FAST = [run("fast", psnr, seed=seed, seconds=1.0 + seed) for seed, psnr in enumerate((20.0, 22.0))]
-SLOW = [run("slow", psnr, seed=seed, seconds=6.0) for seed, psnr in enumerate((25.0, 29.0))]
-BEHIND = [run("behind", psnr, seed=seed, seconds=7.0) for seed, psnr in enumerate((24.0, 26.0))]
+SPEED = (1.0, 0.5)
+"""Of the machine of each seed."""
+
+
+def runs_of(row: str, work: float, scores: tuple[float, float]) -> list[dict[str, Any]]:
+    return [run(row, psnr, seed=seed, seconds=work / SPEED[seed]) for seed, psnr in enumerate(scores)]
+
+
+FAST, SLOW, BEHIND = (
+    runs_of("fast", 2.0, (20.0, 22.0)),
+    runs_of("slow", 6.0, (25.0, 29.0)),
+    runs_of("behind", 7.0, (24.0, 26.0)),
+)
 
 
 def test_rows_lie_at_their_means_and_what_is_slower_and_worse_is_behind_the_front():
     axis: Any = Figure().subplots()
     _plot(axis, lines(results(*FAST, *SLOW, *BEHIND, published={})))
     places = [container.lines[0].get_xydata()[0].tolist() for container in axis.containers]
-    assert places == [[1.5, 21.0], [6.0, 27.0], [7.0, 25.0]]
+    assert places == [[1.0, 21.0], [3.0, 27.0], [3.5, 25.0]]
     (front,) = [line for line in axis.lines if line.get_label() == "Pareto front"]
-    assert front.get_xydata().tolist() == [[1.5, 21.0], [6.0, 27.0]]
+    assert front.get_xydata().tolist() == [[1.0, 21.0], [3.0, 27.0]]
     upper = axis.containers[1].lines[1][-1].get_ydata()
     assert float(np.max(upper)) == pytest.approx(27.0 + np.std([25.0, 29.0], ddof=1))
 
 
 def test_rows_that_differ_in_their_budget_alone_are_one_curve_whose_band_is_the_spread_of_the_seeds():
     axis: Any = Figure().subplots()
-    longer = [
-        each | {"row": "fast-2.5x", "seconds": 3.0, "scores": SLOW[seed]["scores"]} for seed, each in enumerate(FAST)
-    ]
-    _plot(axis, lines(results(*longer, *FAST, *BEHIND, published={})))
+    longer = runs_of("fast-2.5x", 5.0, (25.0, 29.0))
+    _plot(axis, lines(results(*FAST, *longer, *BEHIND, published={})))
     curve, point = axis.containers
     assert (curve.get_label(), point.get_label()) == ("fast", "behind")
-    assert curve.lines[0].get_xydata().tolist() == [[1.5, 21.0], [3.0, 27.0]]
+    assert curve.lines[0].get_xydata().tolist() == [[1.0, 21.0], [2.5, 27.0]]
     (band,) = axis.collections[:1]
     low, high = np.std([20.0, 22.0], ddof=1), np.std([25.0, 29.0], ddof=1)
-    for expected in ((1.5, 21.0 - low), (1.5, 21.0 + low), (3.0, 27.0 - high), (3.0, 27.0 + high)):
+    for expected in ((1.0, 21.0 - low), (1.0, 21.0 + low), (2.5, 27.0 - high), (2.5, 27.0 + high)):
         assert np.abs(band.get_paths()[0].vertices - expected).max(axis=1).min() < 1e-9
 
 
