@@ -147,6 +147,10 @@ class _Trials:
                 self.tried[hypothesis] = self.focus.sharpness(hypothesis)
         return np.stack([self.tried[hypothesis] for hypothesis in hypotheses])
 
+    def height(self, hypothesis: Hypothesis) -> float:
+        """The sharpness of all events under a hypothesis."""
+        return float(self.curve([hypothesis]).sum())
+
     def delay(self, reading: Reading, scale: float) -> Estimate:
         """The best delay of the poses (ms) for one focal length."""
         return _best_delay(
@@ -221,15 +225,18 @@ def is_in_focus(recording: EventRecording, distance: float) -> bool:
     trials = _Trials(EventFocus(recording, distance))
     if not trials.focus.windows:
         return True
-    heights = {one: float(trials.curve([Hypothesis(reading=one)]).sum()) for one in (AS_READ, *READINGS)}
-    readings, is_clear = _best_readings(recording.trajectory, heights, trials.focus.turn < SMALLEST_TURN)
+    focus, heights = trials.focus, {one: trials.height(Hypothesis(reading=one)) for one in (AS_READ, *READINGS)}
+    readings, is_clear = _best_readings(recording.trajectory, heights, focus.turn < SMALLEST_TURN)
+    delays = [delay * MILLISECOND for delay in SHOWN_DELAYS if abs(delay) * MILLISECOND <= focus.largest_delay]
+    others = [trials.height(Hypothesis(delay)) for delay in delays]
+    as_stated = heights[AS_READ]
+    if not is_clear:  # by dense texture. But only poses of this recording are sharpest without a delay
+        is_clear = as_stated == max(heights.values()) and as_stated > max(others, default=math.inf)
     if not is_clear or AS_READ not in readings:
         return False
-    focus, delays = trials.focus, [delay * MILLISECOND for delay in SHOWN_DELAYS]
-    others = [Hypothesis(delay) for delay in delays if abs(delay) <= focus.largest_delay]
     if focus.turn >= SMALLEST_TURN:
-        others += [Hypothesis(focal_scale=lens) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
-    return all(trials.curve([other]).sum() < LENS_GAIN * heights[AS_READ] for other in others)
+        others += [trials.height(Hypothesis(focal_scale=lens)) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
+    return all(other < LENS_GAIN * as_stated for other in others)
 
 
 def clock_of_frames(recording: EventRecording, depth_range: tuple[float, float]) -> Estimate | None:
@@ -566,7 +573,7 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
         if not is_clear:  # the delay was searched with the poses as they were read
             for reading in sorted(heights, key=heights.__getitem__, reverse=True)[:LIKELY_READINGS]:
                 for delayed in trials.delayed(reading):
-                    heights[reading] = max(heights[reading], float(trials.curve([delayed]).sum()))
+                    heights[reading] = max(heights[reading], trials.height(delayed))
             readings, is_clear = _best_readings(recording.trajectory, heights, slides)
         if not is_clear and max(heights, key=heights.__getitem__) is AS_READ:
             is_clear = trials.delay(AS_READ, 1.0).may_be_zero

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaking
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import agreement as agreement_module
-from enerf_ns.dataparsers.inspection.agreement import Agreement
+from enerf_ns.dataparsers.inspection.agreement import Agreement, is_in_focus, usual_depth
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -365,6 +365,11 @@ def test_dense_texture_leaves_several_readings_almost_as_sharp_but_the_clock_sho
     simulate(SimulationSettings("spiral1", width=96, height=72, num_frames=11), tmp_path / "spiral")
     recording = read_recording(tmp_path / "spiral")
     assert agreement(recording).verdict().startswith("poses, clocks and calibration agree")
+    depth = usual_depth(recording, scene_depth_range(recording))
+    assert is_in_focus(recording, depth)
     read = recording.trajectory
     backwards = Trajectory(read.times, read.positions[::-1].copy(), read.quaternions[::-1].copy())
     assert "do not belong together" in words(agreement(replace(recording, trajectory=backwards)))
+    late = replace(recording, trajectory=Trajectory(read.times + 10_000_000, read.positions, read.quaternions))
+    for wrong in (replace(recording, trajectory=backwards), late):
+        assert not is_in_focus(wrong, depth)
