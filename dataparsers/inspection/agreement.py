@@ -9,7 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
+from rich import get_console
 
+from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.focus import (
     AS_READ,
     AS_STATED,
@@ -232,7 +234,7 @@ def is_in_focus(recording: EventRecording, distance: float) -> bool:
     as_stated = heights[AS_READ]
     if not is_clear:  # by dense texture. But only poses of this recording are sharpest without a delay
         is_clear = as_stated == max(heights.values()) and as_stated > max(others, default=math.inf)
-    if not is_clear or AS_READ not in readings:
+    if not (is_clear or focus.has_strong_edges) or AS_READ not in readings:
         return False
     if focus.turn >= SMALLEST_TURN:
         others += [trials.height(Hypothesis(focal_scale=lens)) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
@@ -311,7 +313,10 @@ class Agreement:
     def of(
         cls, recording: EventRecording, depth_range: tuple[float, float] | None, with_frames: bool = True
     ) -> Agreement | None:
-        """Tries other clocks, readings of the poses and focal lengths. Takes some seconds.
+        """Tries other clocks, readings of the poses and focal lengths.
+
+        Takes some seconds, and a minute or two if no reading is clearly the sharpest. A terminal shows that it is at
+        work.
 
         Args:
             recording: Its index is made if it is not there yet.
@@ -323,13 +328,15 @@ class Agreement:
         """
         usual = usual_depth(recording, depth_range)
         near, far = depth_range or (usual, usual)
-        search = _search(recording, usual)
-        if search is None:
-            return None
-        trials, readings, is_clear, lens = search
-        focus = trials.focus
-        pose_delay, focal_scale = trials.clock_and_lens(readings[0], lens)
-        trials.curve([hypothesis for hypothesis in shown_hypotheses() if focus.allows(hypothesis.focal_scale)])
+        index_events(recording)  # which may show a bar of its own
+        with get_console().status("Comparing the events with poses, clocks and calibration"):
+            search = _search(recording, usual)
+            if search is None:
+                return None
+            trials, readings, is_clear, lens = search
+            focus = trials.focus
+            pose_delay, focal_scale = trials.clock_and_lens(readings[0], lens)
+            trials.curve([hypothesis for hypothesis in shown_hypotheses() if focus.allows(hypothesis.focal_scale)])
         total = {hypothesis: float(curves.sum()) for hypothesis, curves in trials.tried.items()}
         of_events = cls(focus, None, 0, total, readings, is_clear, pose_delay, None, focal_scale, None)
         if not with_frames:
@@ -371,9 +378,8 @@ class Agreement:
         if self.problems():
             return []
         if not self.is_clear:
-            camera = self.focus.recording.camera
-            size = f"{camera.width} x {camera.height} pixels"
-            return [OpenQuestion(FITS, f"on {size}, other readings of the poses make the events about as sharp")]
+            alike = "other readings of the poses make the events about as sharp"
+            return [OpenQuestion(FITS, f"{self.focus.chance}, and {alike}")]
         others = [reading for reading in self.readings if reading is not AS_READ]
         alike = [OpenQuestion("how the poses are to be read", f"{_either(others)} fit as well")] if others else []
         why = "this recording does not identify it"
@@ -383,7 +389,7 @@ class Agreement:
         """The measurements in words, by name."""
         others = "; ".join(reading.words for reading in self.readings if reading is not AS_READ)
         if not self.is_clear:
-            poses = "no reading of the poses makes the events sharp"
+            poses = f"{'other readings are about as' if self.focus.chance else 'no reading makes the events'} sharp"
         elif AS_READ in self.readings:
             poses = "sharpest as they were read"
         else:
@@ -426,7 +432,7 @@ class Agreement:
         focal = list(self._focal_problems())
         if focal and not FOCAL_SCALES[0] <= self.focal_scale.value <= FOCAL_SCALES[-1]:
             return focal  # with the calibration of another lens, poses and clocks do not fit either
-        if not self.is_clear and self.focus.is_small:
+        if not self.is_clear and self.focus.chance:
             return [*self._pose_problems()]
         if not self.is_clear:
             return [
@@ -570,6 +576,8 @@ def _search(recording: EventRecording, distance: float) -> tuple[_Trials, list[R
         }
         slides = trials.focus.turn < SMALLEST_TURN
         readings, is_clear = _best_readings(recording.trajectory, heights, slides)
+        if trials.focus.has_strong_edges and not is_clear:
+            return trials, readings, is_clear, 1.0  # no further search can tell readings apart
         if not is_clear:  # the delay was searched with the poses as they were read
             for reading in sorted(heights, key=heights.__getitem__, reverse=True)[:LIKELY_READINGS]:
                 for delayed in trials.delayed(reading):

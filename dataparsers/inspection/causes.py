@@ -42,7 +42,7 @@ def why_not_explained(
 ) -> str | None:
     """The likely cause why a training cannot explain the events, as a clause with the advice; None if nothing is wrong.
 
-    Takes a second if nothing is wrong, and some seconds otherwise.
+    Takes some seconds if nothing is wrong, and as long as `Agreement.of` otherwise.
 
     Args:
         recording: The recording as it is trained on. Its index is made if it is not there yet.

@@ -52,6 +52,10 @@ TILES_OF_CHANCE = 12
 """Smallest sensor, in tiles, on which right poses are always clearly sharper than others. On smaller ones, a few tiles
 can be as sharp by chance."""
 
+EVENTS_OF_CHANCE = 7.0
+"""Number of events that a passing edge fires at a pixel in the mean, above which a few strong edges alone decide how
+sharp the events are. Before a black background it is 9; on textured scenes with usual thresholds it is 1 to 6."""
+
 PLANES = np.arange(0.0, 65.0)
 """Planes of the sweep, as disparities: grid pixels by which a point on the plane moves while the camera moves through
 the window."""
@@ -224,7 +228,6 @@ class EventFocus:
         camera = recording.camera
         tiles = camera.width * camera.height * grid_scale(camera) ** 2 / TILE**2
         self.is_small = tiles < TILES_OF_CHANCE
-        """Whether a few tiles of the sensor can be sharp by chance."""
         if tiles >= FEWEST_TILES:
             start, end = _posed_span(recording)
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
@@ -236,6 +239,26 @@ class EventFocus:
     def speed(self) -> float:
         """Speed of the picture in fast windows (90th percentile), pixels per second."""
         return float(np.percentile([window.speed for window in self.windows], 90))
+
+    @cached_property
+    def events_an_edge(self) -> float:
+        """Mean number of events that a passing edge fires at a pixel, median over the windows; 0 without windows."""
+        camera = self.recording.camera
+        return float(np.median([_events_an_edge(window, camera) for window in self.windows] or [0.0]))
+
+    @property
+    def has_strong_edges(self) -> bool:
+        """Whether a few edges fire most events, so that other readings of the poses are about as sharp by chance."""
+        return self.events_an_edge > EVENTS_OF_CHANCE
+
+    @property
+    def chance(self) -> str:
+        """The reason why other readings of the poses may be about as sharp, as a clause; empty if there is none."""
+        if self.is_small:
+            return f"{self.recording.camera.width} x {self.recording.camera.height} pixels show too little"
+        if self.has_strong_edges:
+            return f"a few strong edges fire most events, {self.events_an_edge:.0f} at a time at each pixel"
+        return ""
 
     @cached_property
     def turn(self) -> float:
@@ -370,6 +393,18 @@ def _some(events: Events, at_most: int) -> Events:
     """About `at_most` of the events, evenly taken."""
     step = max(round(len(events) / at_most), 1)
     return Events(events.x[::step], events.y[::step], events.t[::step], events.p[::step])
+
+
+def _events_an_edge(window: Window, camera: Camera) -> float:
+    """Mean number of events that an edge fires at a pixel while it passes: of one polarity, each later than the one
+    before by no more than the picture takes to move by a pixel. The mean is over the events."""
+    events, width = window.events, PATH_OF_WINDOW * camera.width
+    pixels = events.y.astype(np.int64) * camera.width + events.x
+    order = np.argsort(pixels, kind="stable")
+    steps = [np.diff(values[order]) for values in (pixels, events.p, events.t)]
+    same = (steps[0] == 0) & (steps[1] == 0) & (steps[2] <= (window.end - window.start) / width)
+    counts = np.diff(np.concatenate([[0], np.flatnonzero(~same) + 1, [len(order)]]))
+    return float((counts**2).sum() / counts.sum())
 
 
 def _windows(recording: EventRecording, start: int, end: int, distance: float) -> list[Window]:

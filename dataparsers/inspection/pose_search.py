@@ -42,7 +42,8 @@ def mend_poses(folder: Path, place: Path) -> list[str]:
         turns = Rotation.from_quat(body.quaternions) * Rotation.from_matrix(reading.axes)
         _write(folder, body.times, body.positions, turns.as_quat())
     elif not found.is_clear or AS_READ not in found.readings:
-        return [f"The poses are as stated, but: {problem.what} {problem.advice}" for problem in found.problems()]
+        problems = [f"The poses are as stated, but: {problem.what} {problem.advice}" for problem in found.problems()]
+        return problems or [f"The poses are as stated. {found.verdict()}"]
     found = _agreement(folder, place, with_frames=True)
     assert found is not None
     delay, frames = found.pose_delay, found.frame_delay

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaking
+from enerf_ns.bench.validation import CHOSEN_ON
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import agreement as agreement_module
 from enerf_ns.dataparsers.inspection.agreement import Agreement, is_in_focus, usual_depth
@@ -373,3 +374,15 @@ def test_dense_texture_leaves_several_readings_almost_as_sharp_but_the_clock_sho
     late = replace(recording, trajectory=Trajectory(read.times + 10_000_000, read.positions, read.quaternions))
     for wrong in (replace(recording, trajectory=backwards), late):
         assert not is_in_focus(wrong, depth)
+
+
+@pytest.mark.slow
+def test_strong_edges_before_black_leave_open_whether_poses_fit(tmp_path: Path):
+    """Right poses of a camera around the statue of the validation set are as sharp as other readings by chance."""
+    settings = CHOSEN_ON["statue"].simulation_settings(tmp_path, width=160, height=120, layout="event_recording")
+    simulate(replace(settings, num_frames=2), tmp_path / "statue")
+    recording = read_recording(tmp_path / "statue")
+    found = agreement(recording)
+    assert found.focus.has_strong_edges and not found.is_clear
+    assert found.problems() == [] and "a few strong edges fire most events" in found.verdict()
+    assert is_in_focus(recording, usual_depth(recording, scene_depth_range(recording)))

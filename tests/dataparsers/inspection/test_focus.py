@@ -11,7 +11,7 @@ import torch
 
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, recording_of_points, shaking
 from enerf_ns.dataparsers.inspection.focus import AS_STATED, FEWEST_EVENTS, EventFocus, Hypothesis
-from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.dataparsers.scene.depth_range import TILE
 
@@ -67,6 +67,16 @@ def test_wrong_clocks_and_focal_lengths_are_less_sharp(focus: EventFocus):
         assert focus.sharpness(Hypothesis(delay * 1_000_000)).sum() < 0.97 * right
     for scale in (0.8, 1.25):
         assert focus.allows(scale) and focus.sharpness(Hypothesis(0, scale)).sum() < 0.99 * right
+
+
+def test_an_edge_that_fires_more_events_at_a_time_is_a_strong_one(focus: EventFocus):
+    stated = focus.recording
+    events = next(iter(stated.stream_events()))
+    several = Events(*(np.repeat(values, 10) for values in (events.x, events.y, events.t, events.p)))
+    strong = EventFocus(replace(stated, stream_events=lambda: iter([several])), 1.7)
+    assert 1.0 <= focus.events_an_edge < 2.0 and not focus.has_strong_edges
+    assert strong.has_strong_edges  # and windows that had too few events join in
+    assert strong.events_an_edge == pytest.approx(10.0 * focus.events_an_edge, rel=0.01)
 
 
 def test_neither_the_unit_of_length_nor_the_clock_matters(focus: EventFocus):
