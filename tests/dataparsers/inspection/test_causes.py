@@ -10,12 +10,17 @@ import faults
 import numpy as np
 import pytest
 
+from enerf_ns.bench.experiments import FIVE, SEQUENCES
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, recording_of_points, shaking
+from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
+from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause, why_not_explained
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.poses.corrections import Corrections
+from enerf_ns.simulator.engine import simulate
 
 STATED = 0.8, 4.0
 
@@ -91,6 +96,19 @@ def test_the_mend_of_wrong_poses_is_never_a_depth_range(
 def test_right_poses_have_no_cause(shaken: EventRecording):
     assert why_not_explained(shaken, depth_range_or_cause(shaken), shaken) is None
     assert why_not_explained(shaken, STATED, shaken) is None
+
+
+@pytest.mark.sweep(1)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*FIVE, *CHOSEN_ON, *ONLY_SCORED])
+def test_no_right_recording_of_the_benchmarks_has_a_cause(name: str, tmp_path: Path):
+    sequence = SEQUENCES[name]
+    size = {"width": sequence.simulation.get("width", 160), "height": sequence.simulation.get("height", 120)}
+    if size["width"] > 346:
+        size = {side: pixels // 2 for side, pixels in size.items()}
+    simulate(sequence.simulation_settings(tmp_path, **size, num_frames=11), tmp_path / "recording")
+    recording = read_recording(tmp_path / "recording")
+    assert why_not_explained(recording, scene_depth_range(recording), recording) is None
 
 
 def test_a_depth_range_without_the_scene_is_named(shaken: EventRecording):
