@@ -60,6 +60,10 @@ PLANES = np.arange(0.0, 65.0)
 """Planes of the sweep, as disparities: grid pixels by which a point on the plane moves while the camera moves through
 the window."""
 
+FREE_DIRECTIONS, FREE_STEPS = 12, np.arange(0.0, 25.0)
+"""Number of directions of motions without poses, and their distances from the middle of a window to its ends, grid
+pixels."""
+
 NEAREST_PLANE = 2.0
 """Smallest depth of a plane, as a multiple of the largest distance of the camera from its place in mid-window."""
 
@@ -274,6 +278,27 @@ class EventFocus:
         """Sharpness of each tile at its best depth, as a share of the sum over the tiles of a window."""
         sweeps = (self._sweep(window, _some(window.events, EVENTS_PER_WINDOW), hypothesis) for window in self.windows)
         return np.concatenate([sharpness.max(0) for sharpness, *_ in sweeps])
+
+    @cached_property
+    def free_sharpness(self) -> float:
+        """Sum of the sharpness if each tile moves evenly, in that direction and as far as makes it sharpest.
+
+        No poses are needed. Right poses nearly reach it, or exceed it where the camera turns or the motion changes.
+        """
+        total, camera, angles = 0.0, self._camera(AS_STATED), np.arange(FREE_DIRECTIONS) * 2.0 * np.pi / FREE_DIRECTIONS
+        for window in self.windows:
+            events = _some(window.events, EVENTS_PER_WINDOW)
+            still = np.broadcast_to(np.eye(3, 4), (len(events), 3, 4))
+            rays, _, ahead = rays_in_view(camera.pixel_directions()[events.y, events.x], still, still[0])
+            stretch = self._stretch(AS_STATED)[events.y, events.x][ahead]
+            when = 2.0 * (events.t[ahead] - window.instant) / (window.end - window.start)
+            sharpest = np.zeros(1)
+            for angle in angles:
+                ways = when[:, None] * [np.cos(angle), np.sin(angle), 0.0]
+                dispersion, votes = sweep_planes(rays, ways, camera, FREE_STEPS, stretch)
+                sharpest = np.maximum(sharpest, (dispersion * votes).max(0))
+            total += float(sharpest.sum()) * TILE**2 / len(events)
+        return total
 
     def picture(
         self, window: Window, hypothesis: Hypothesis | None = AS_STATED

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from enerf_ns.bench.numerics.points import CAMERA, TURNING, points_between, recording_of_points, shaking
-from enerf_ns.dataparsers.inspection.focus import AS_STATED, FEWEST_EVENTS, EventFocus, Hypothesis
+from enerf_ns.dataparsers.inspection.focus import AS_STATED, FEWEST_EVENTS, INVERSE, EventFocus, Hypothesis
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.dataparsers.scene.depth_range import TILE
@@ -67,6 +67,11 @@ def test_wrong_clocks_and_focal_lengths_are_less_sharp(focus: EventFocus):
         assert focus.sharpness(Hypothesis(delay * 1_000_000)).sum() < 0.97 * right
     for scale in (0.8, 1.25):
         assert focus.allows(scale) and focus.sharpness(Hypothesis(0, scale)).sum() < 0.99 * right
+
+
+def test_right_poses_are_as_sharp_as_any_motion_and_wrong_ones_are_not(focus: EventFocus):
+    assert focus.free_sharpness < focus.sharpness().sum()
+    assert focus.free_sharpness > 1.1 * focus.sharpness(Hypothesis(reading=INVERSE)).sum()
 
 
 def test_an_edge_that_fires_more_events_at_a_time_is_a_strong_one(focus: EventFocus):
