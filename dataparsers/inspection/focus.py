@@ -232,6 +232,7 @@ class EventFocus:
         camera = recording.camera
         tiles = camera.width * camera.height * grid_scale(camera) ** 2 / TILE**2
         self.is_small = tiles < TILES_OF_CHANCE
+        """Whether a few tiles of the sensor can be sharp by chance."""
         if tiles >= FEWEST_TILES:
             start, end = _posed_span(recording)
             self.windows = _windows(recording, start + self.largest_delay, end - self.largest_delay, distance)
