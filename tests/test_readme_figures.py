@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from results import PAGES, written
 
+from enerf_ns.bench.experiments import EXPERIMENTS
+from enerf_ns.bench.published import MEAN
 from enerf_ns.bench.tables import markdown
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +62,18 @@ def test_every_result_file_is_shown_and_from_one_version_of_the_code():
     assert {str(file.relative_to(ROOT)) for file in committed} | {gate} == set(shown)
     versions = {run["version"] for file in committed for run in json.loads(file.read_text())["runs"]}
     assert len(versions) <= 1 and not any("dirty" in version for version in versions)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "benchmarks" / "results").glob("*.json")), ids=lambda file: file.stem)
+def test_a_result_file_says_of_its_experiment_what_the_experiment_says(file: Path):
+    results, experiment = json.loads(file.read_text()), EXPERIMENTS[file.stem]
+    assert results["published"] == {
+        sequence: rows
+        for sequence, rows in experiment.published.items()
+        if sequence in {run["sequence"] for run in results["runs"]} | {MEAN}
+    }
+    assert (results["notes"], results["columns"]) == (list(experiment.notes), list(experiment.columns))
+    assert (results["sentence"], results["source"]) == (experiment.sentence, experiment.source)
 
 
 def test_marks_are_found_and_those_without_an_end_are_not_passed_over():

@@ -391,7 +391,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ("nerf-blurred", "e2vid", "filter", "events", "events+blurred"),
         recorded=("slider_depth",),
         protocols=("raw", "log-affine-set"),
-        columns=("psnr", "ssim", "correlation", "lpips_vgg"),
+        columns=("psnr", "ssim", "correlation", "lpips", "lpips_vgg"),
         published=published.SLIDER_DEPTH,
         source="Event-3DGS",
         notes=(
@@ -404,7 +404,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ("events",),
         recorded=tuple(published.UZH),
         protocols=("raw", "log-affine-set"),
-        columns=("psnr", "ssim", "lpips_vgg"),
+        columns=("psnr", "ssim", "lpips", "lpips_vgg"),
         published=published.UZH,
         source="Event-3DGS",
         notes=("Event-3DGS does not name the views that it scores. Here every fourth frame is held out.",),
@@ -417,8 +417,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=published.EDS,
         source="GPERT",
         notes=(
-            "GPERT copied EventSplat's rows, whose LPIPS is of VGG where its own is of AlexNet, and follows Robust "
-            "e-NeRF's evaluation; here the whole recording is used and every fourth frame held out.",
+            "GPERT copied EventSplat's rows, and follows Robust e-NeRF's evaluation; here the whole recording is used "
+            "and every fourth frame held out.",
         ),
     ),
     "tum-vie": Experiment(
