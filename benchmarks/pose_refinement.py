@@ -52,6 +52,7 @@ length before training, and nothing later; and all numbers at once by Adam, at e
 wrong, as other codes refine poses."""
 
 COMPARED = "fixed", "refined"
+PARTS_OF_MOUNT = "rotation", "translation"
 
 ADAM_RATE, ADAM_DECAYS = 0.02, (0.9, 0.99)
 """Learning rate, in the unit of each number, and decays of the moments."""
@@ -105,14 +106,14 @@ def main() -> None:
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(arguments.jobs) as pool:
         list(pool.map(run, cells))
-    chosen = [
+    shown = [
         result
         for result in done
         if result["recording"] in arguments.recordings
         and result["fault"] in arguments.faults
         and result["steps"] == arguments.steps
     ]
-    print(table(chosen))
+    print(table(shown))
 
 
 def right_poses(name: str, work: Path) -> Path:
@@ -192,6 +193,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     from enerf_ns.dataparsers.formats.registry import read_recording
     from enerf_ns.evaluation.scores import mean_scores
     from enerf_ns.method.held_out_views import held_out_views
+    from enerf_ns.method.origin import code_version
     from enerf_ns.method.runs import method_config, train
 
     name, seed = cell["recording"], cell["seed"]
@@ -221,6 +223,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     given = read_recording(folder)
     return {
         **cell,
+        "version": code_version(),
         **{key: float(scores[key]) for key in ("psnr", "ssim", "depth_rmse") if isinstance(scores.get(key), float)},
         "event_correlation": events["event_correlation"],
         "seconds": run.train_seconds,
@@ -292,12 +295,21 @@ def errors(true: Any, other: Any) -> tuple[float, float]:
     return 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((left**2).sum(axis=1).mean())))
 
 
-def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int = 1000) -> str:
-    """PSNR and correlation of each fault on each recording after as many steps, fixed and refined, as Markdown."""
+def chosen(results: list[dict[str, Any]], recording: str, fault: str, row: str, steps: int) -> list[dict[str, Any]]:
+    """The trainings of one row, by seed."""
+    wanted = recording, fault, row, steps
+    found = [one for one in results if (one["recording"], one["fault"], one["row"], one["steps"]) == wanted]
+    return sorted(found, key=lambda one: one["seed"])
+
+
+def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int) -> str:
+    """PSNR and correlation of each fault on each recording after as many steps, fixed and refined, as Markdown.
+
+    Wrong poses that stay fixed are left out where no training of them went on for as many steps.
+    """
 
     def cell(recording: str, fault: str, row: str) -> str:
-        wanted = recording, fault, row, steps
-        runs = [one for one in results if (one["recording"], one["fault"], one["row"], one["steps"]) == wanted]
+        runs = chosen(results, recording, fault, row, steps)
         psnr, correlation = ([one[key] for one in runs] for key in ("psnr", "event_correlation"))
         spread = f" ± {np.std(psnr, ddof=1):.2f}" if len(runs) > 1 else ""
         return f"{np.mean(psnr):.2f}{spread}, {np.mean(correlation):.2f}" if runs else "-"
@@ -307,6 +319,37 @@ def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults
     for fault in faults:
         cells = [cell(recording, fault, row) for recording in recordings for row in COMPARED]
         lines.append(f"| {' | '.join([fault, *cells])} |")
+    return "\n".join(lines)
+
+
+def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int) -> str:
+    """What refinement found of each fault on each recording, one value for each seed, as Markdown."""
+
+    def values(runs: list[dict[str, Any]], key: str) -> list[Any]:
+        return [one[key] for one in runs]
+
+    def errors(runs: list[dict[str, Any]], key: str) -> str:
+        positions, turns = np.mean(values(runs, key), axis=0)
+        return f"{positions:.1f} mm and {turns:.2f}°"
+
+    def cell(recording: str, fault: str) -> str:
+        runs, wrong = chosen(results, recording, fault, "refined", steps), FAULTS[fault]
+        if not runs:
+            return "-"
+        told = []
+        if "clock" in wrong:
+            told.append(f"clock {', '.join(f'{clock:.2f}' for clock in values(runs, 'clock'))} ms")
+        if "focal" in wrong:
+            told.append(f"focal length {', '.join(f'{focal:.3f}' for focal in values(runs, 'focal'))}")
+        if "mount" in wrong:
+            parts = ([part for part in PARTS_OF_MOUNT if part in found] for found in values(runs, "corrected"))
+            told.append(", ".join(" and ".join(found) or "no part" for found in parts))
+        if {"noise", "drift"} & set(wrong):
+            told.append(f"{errors(runs, 'ate_before')} → {errors(runs, 'ate_after')}")
+        return "; ".join(told)
+
+    lines = [f"| wrong | {' | '.join(f'`{name}`' for name in recordings)} |", f"|{' --- |' * (len(recordings) + 1)}"]
+    lines += [f"| {' | '.join([fault, *(cell(name, fault) for name in recordings)])} |" for fault in faults]
     return "\n".join(lines)
 
 

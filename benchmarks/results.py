@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image, ImageDraw
-from pose_refinement import scores_by_fault
+from pose_refinement import found_by_fault, scores_by_fault
 
 from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.measures import VIEW
@@ -65,8 +65,14 @@ MARKED = re.compile(r"(<!-- enerf bench \S+: (\S+) -->\n).*?(<!-- end of \S+ -->
 SCORES = re.compile(r"(<!-- scores of (.+?) on (.+?) -->\n).*?(<!-- scores end -->)", re.DOTALL)
 """The mark of a small table: rows, then experiment/sequence or experiment/sequence/protocol, with spaces between."""
 
-REFINEMENT = re.compile(r"(<!-- pose refinement on (.+?) of (.+?) -->\n).*?(<!-- pose refinement ends -->)", re.DOTALL)
-"""The mark of the table of wrong poses: its recordings, and its faults, with spaces between."""
+REFINEMENT = re.compile(
+    r"(<!-- pose refinement, (scores|found) on (.+?) of (.+?) after (\d+) steps -->\n).*?"
+    r"(<!-- pose refinement ends -->)",
+    re.DOTALL,
+)
+"""The mark of a table of wrong poses: what it shows, its recordings and its faults, with spaces between."""
+
+OF_REFINEMENT = {"scores": scores_by_fault, "found": found_by_fault}
 
 FIGURE_WIDTH = 1250
 """Most pixels across a figure of held-out views."""
@@ -112,10 +118,10 @@ def scores(rows: list[str], places: list[str]) -> str:
     return f"{table.markdown()}\n\nEach training took {steps} steps on one CPU core, with version {version}."
 
 
-def refinement(recordings: list[str], faults: list[str]) -> str:
-    """The table of wrong poses from the committed trainings of benchmarks/pose_refinement.py."""
+def refinement(shown: str, recordings: list[str], faults: list[str], steps: int) -> str:
+    """A table of wrong poses from the committed trainings of benchmarks/pose_refinement.py."""
     trained = (RESULTS / "pose-refinement.jsonl").read_text().splitlines()
-    return scores_by_fault([json.loads(line) for line in trained], recordings, faults)
+    return OF_REFINEMENT[shown]([json.loads(line) for line in trained], recordings, faults, steps)
 
 
 def views(bench: Bench) -> Image.Image:
@@ -171,7 +177,8 @@ def written(page: str) -> str:
         return f"{found[1]}\n{scores(found[2].split(), found[3].split())}\n\n{found[4]}"
 
     def wrong_poses(found: re.Match[str]) -> str:
-        return f"{found[1]}\n{refinement(found[2].split(), found[3].split())}\n\n{found[4]}"
+        made = refinement(found[2], found[3].split(), found[4].split(), int(found[5]))
+        return f"{found[1]}\n{made}\n\n{found[6]}"
 
     return REFINEMENT.sub(wrong_poses, SCORES.sub(small, MARKED.sub(table, page)))
 
