@@ -7,6 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import pose_refinement
 import results
 from PIL import Image
 from small_runs import SMALL_BENCH
@@ -64,3 +65,25 @@ def test_a_small_table_has_the_rows_and_the_protocol_that_its_mark_names():
         psnr = np.mean([run["scores"]["raw"]["psnr"] for run in runs if run["row"] == row])
         assert f"| slider_depth | {row} | {psnr:.2f}" in page.replace("**", "")
     assert "e2vid" not in page and "by hand" not in page
+
+
+def test_tables_of_wrong_poses_have_the_trainings_of_their_number_of_steps():
+    """One value for each seed in what was found, in the order of the seeds; means where errors are told."""
+    one = {"recording": "room", "fault": "all", "row": "refined", "steps": 10, "event_correlation": 0.5}
+    ate = {"ate_before": [4.0, 0.4], "ate_after": [2.0, 0.1]}
+    seeds = [
+        {**one, "seed": 1, "psnr": 22.0, "clock": 10.25, "focal": 1.0, "corrected": ["clock", "rotation"], **ate},
+        {**one, "seed": 0, "psnr": 20.0, "clock": 9.75, "focal": 0.97, "corrected": ["translation", "rotation"], **ate},
+    ]
+    seeds[0]["ate_after"] = [3.0, 0.3]
+    longer = {**seeds[0], "steps": 20, "psnr": 30.0}
+    fixed = {**longer, "row": "fixed", "psnr": 12.0}
+    trained = [*seeds, longer, fixed]
+    scores = pose_refinement.scores_by_fault(trained, ["room"], ["all", "none"], 10)
+    assert scores.splitlines()[2:] == ["| all | - | 21.00 ± 1.41, 0.50 |", "| none | - | - |"]
+    assert "| all | 12.00, 0.50 | 30.00, 0.50 |" in pose_refinement.scores_by_fault(trained, ["room"], ["all"], 20)
+    found = pose_refinement.found_by_fault(trained, ["room", "hall"], ["all"], 10)
+    assert found.splitlines()[2] == (
+        "| all | clock 9.75, 10.25 ms; focal length 0.970, 1.000; rotation and translation, rotation; "
+        "4.0 mm and 0.40° → 2.5 mm and 0.20° | - |"
+    )
