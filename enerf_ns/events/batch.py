@@ -38,6 +38,10 @@ class EventBatch:
     slopes: Float[Tensor, "pairs 2"] | None = None
     """Slope of the rendered log brightness at either instant, per second, for the first pairs, and 0 for the others.
     None if the sensor model needs no slopes."""
+    links: EventBatch | None = None
+    """Chains: link i leads from the second instant of pair i to the first instant of pair n + i of the same pixel, for
+    the n links of pairs of events and for those of any instants alike. Links have no rays of their own. None: no pair
+    is in a chain."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -46,6 +50,16 @@ class EventBatch:
     def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """pixels, start, end, on and off."""
         return self.pixels, self.start, self.end, self.on, self.off
+
+    @property
+    def num_changes_of_events(self) -> int:
+        """Number of independent changes of brightness between events: the pairs, and the links of their chains."""
+        return self.num_of_events + (0 if self.links is None else self.links.num_of_events)
+
+    @property
+    def num_changes_of_any(self) -> int:
+        """Number of independent changes of brightness between any instants: the pairs, and the links of chains."""
+        return self.num_any + (0 if self.links is None else self.links.num_any)
 
     @property
     def fired(self) -> slice:
@@ -72,6 +86,13 @@ class EventBatch:
         """Slice of the pairs of silent pixels."""
         return slice(len(self) - self.num_silent, None)
 
+    @property
+    def chains(self) -> tuple[tuple[int, int], ...]:
+        """Parts of the pairs that are in chains: number of the first pair, and number n of the chains."""
+        if self.links is None:
+            return ()
+        return (0, self.links.num_of_events), (self.num_of_events, self.links.num_any)
+
     def followed_by(self, others: EventBatch) -> EventBatch:
         """These pairs, and then the pairs of another batch.
 
@@ -87,6 +108,9 @@ class EventBatch:
                 self.start.new_zeros(len(part)).float() if part.ahead is None else part.ahead for part in (self, others)
             ]
             ahead = torch.cat(parts)
+        links = self.links
+        if others.links is not None:
+            links = others.links if links is None else links.followed_by(others.links)
         return EventBatch(
             *joined,
             num_silent=others.num_silent,
@@ -94,10 +118,11 @@ class EventBatch:
             starts_at_events=self.starts_at_events,
             rates=rates,
             ahead=ahead,
+            links=links,
         )
 
     def subset(self, chosen: Bool[Tensor, " pairs"]) -> EventBatch:
-        """The chosen pairs."""
+        """The chosen pairs, without the links of chains."""
         columns = (column[chosen] for column in self.columns)
         num_silent, num_any = int(chosen[self.silent].sum()), int(chosen[self.of_any].sum())
         rates, ahead, slopes = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -100,22 +101,60 @@ class EventPairSampler:
             blind_ns: How long a pixel is blind after an event, to add the event rates around the instants to the batch.
                 Default: no rates.
         """
+        pair, pixels = self._draw(batch_size, generator)
+        if self.window:
+            return _pairs_of(self.index, pixels, *self._window_pair(pair), blind_ns)
+        start, end = (self._event(instant) for instant in self._partner_pair(pair, pixels))
+        return _pairs_of(self.index, pixels, start, end, blind_ns)
+
+    def sample_chains(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
+        """Draws `batch_size` pairs with replacement, two of them in a chain: four events of one pixel, each at most
+        `max_distance` events of the pixel after the one before. Of an odd number, one pair is in no chain.
+
+        Four events have six changes of brightness between them, of which two pairs alone use two, for as many rays. A
+        chain begins with a pair that is drawn as in `sample`. It is moved to an earlier event where the pixel has too
+        few later events. Where it has fewer than four events in all, the last one is repeated.
+
+        Raises:
+            ValueError: The pairs are those of a window of time.
+        """
+        if self.window:
+            raise ValueError("Pairs of events within a window of time are not in chains.")
+        number = batch_size // 2
+        pair, pixels = self._draw(batch_size - number, generator)
+        start, end = self._partner_pair(pair, pixels)
+        steps = torch.full_like(start[:number].expand(2, -1), self.max_distance)
+        further = 1 + _randint(steps, generator)
+        chain = torch.stack([start[:number], end[:number], end[:number] + further[0], end[:number] + further.sum(0)])
+        first, last = self._offsets[pixels[:number]], self._offsets[pixels[:number] + 1] - 1
+        chain = torch.minimum(chain - torch.minimum((chain[3] - last).clamp(min=0), chain[0] - first), last)
+        events = self._event(chain)
+        alone = slice(number, None)
+        pairs = _pairs_of(
+            self.index,
+            torch.cat([pixels[:number], pixels[:number], pixels[alone]]),
+            torch.cat([events[0], events[2], self._event(start[alone])]),
+            torch.cat([events[1], events[3], self._event(end[alone])]),
+            blind_ns,
+        )
+        return replace(pairs, links=_pairs_of(self.index, pixels[:number], events[1], events[2], blind_ns))
+
+    def _draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Numbers of random pairs, and their pixels."""
         device = self.index.times.device
         if self._active is None:
-            pair = torch.randint(self.num_pairs, (batch_size,), generator=generator, device=device)
-            pixels = torch.searchsorted(self._pair_offsets, pair, right=True) - 1
-        else:
-            pixels = self._active[torch.randint(len(self._active), (batch_size,), generator=generator, device=device)]
-            begin = self._pair_offsets[pixels]
-            pair = begin + _randint(self._pair_offsets[pixels + 1] - begin, generator)
-        start, end = self._window_pair(pair) if self.window else self._partner_pair(pair, pixels)
-        return _pairs_of(self.index, pixels, start, end, blind_ns)
+            pair = torch.randint(self.num_pairs, (number,), generator=generator, device=device)
+            return pair, torch.searchsorted(self._pair_offsets, pair, right=True) - 1
+        pixels = self._active[torch.randint(len(self._active), (number,), generator=generator, device=device)]
+        begin = self._pair_offsets[pixels]
+        return begin + _randint(self._pair_offsets[pixels + 1] - begin, generator), pixels
 
     def _window_pair(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         start = self._starts[pair]
         return start.long(), self._lasts[torch.searchsorted(self._lasts, start)].long()
 
     def _partner_pair(self, pair: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Instants of pairs, which are numbered over all pixels."""
         # n instants have n - d pairs of distance d. Distances d and m + 1 - d, m the largest, together have 2n - m - 1,
         # whatever d is: in a table with rows of that length, row r holds distance r + 1 and then distance m - r.
         first = self._offsets[pixels]
@@ -128,7 +167,7 @@ class EventPairSampler:
         second_half = column >= count - row - 1
         distance = torch.where(second_half, largest - row, row + 1)
         start = first + torch.where(second_half, column - (count - row - 1), column)
-        return self._event(start), self._event(start + distance)
+        return start, start + distance
 
     def _event(self, instants: Tensor) -> Tensor:
         """Numbers of the events at some instants, which are numbered over all pixels."""
@@ -361,8 +400,9 @@ class InstantPairSampler:
     mean square). On average, the rest lies in the direction of the last event: `EventBatch.ahead`. Pairs without events
     are kept, too, since pairs with events alone would show too much contrast.
 
-    A pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
-    stretches. The other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
+    Two pairs are in a chain, as those of `EventPairSampler.sample_chains`: four instants of one pixel, in order. A
+    pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
+    stretches. Each other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
     instant, it is mirrored. Between two stretches, it moves to the beginning of the next stretch; after the last one,
     to its end. If pixels are blind for a while after an event, changes during that time are missing from the sum.
 
@@ -392,25 +432,45 @@ class InstantPairSampler:
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs by a generator on the device of the index."""
-        pixels, one, _, _ = self._moments.draw(batch_size, generator)
+        """Draws `batch_size` pairs by a generator on the device of the index. Of an odd number, the last is in no
+        chain."""
+        number = batch_size // 2
+        pixels, one, _, _ = self._moments.draw(batch_size - number, generator)
+        others = [self._other(one[:number], generator) for _ in range(3)]
+        chain = torch.stack([one[:number], *others]).sort(dim=0)[0]
+        alone = slice(number, None)
+        both = torch.stack([one[alone], self._other(one[alone], generator)]).sort(dim=0)[0]
+        pairs = self._pairs(
+            torch.cat([pixels[:number], pixels[:number], pixels[alone]]),
+            torch.cat([chain[0], chain[2], both[0]]),
+            torch.cat([chain[1], chain[3], both[1]]),
+        )
+        return replace(pairs, links=self._pairs(pixels[:number], chain[1], chain[2]))
+
+    def _other(self, one: Int64[Tensor, " pairs"], generator: torch.Generator) -> Int64[Tensor, " pairs"]:
+        """Random instants near others, in the time that is used."""
         steps = torch.full_like(one, 2 * self.max_duration_ns + 1)
         other = one + _randint(steps, generator) - self.max_duration_ns
         other = torch.where(other < self.start_ns, 2 * self.start_ns - other, other)
         other = torch.where(other > self.end_ns, 2 * self.end_ns - other, other)
         stretches = self._moments.stretches
-        if stretches is not None:
-            part = _part(other, stretches)
-            following = torch.cat([stretches[:, 0], stretches[-1:, 1]])
-            other = torch.where(part % 2 == 0, following[part // 2], other)
-        start, end = torch.minimum(one, other), torch.maximum(one, other)
+        if stretches is None:
+            return other
+        part = _part(other, stretches)
+        following = torch.cat([stretches[:, 0], stretches[-1:, 1]])
+        return torch.where(part % 2 == 0, following[part // 2], other)
+
+    def _pairs(
+        self, pixels: Int64[Tensor, " pairs"], start: Int64[Tensor, " pairs"], end: Int64[Tensor, " pairs"]
+    ) -> EventBatch:
+        """The pairs of these instants, of which the second is not before the first."""
         begin = self.index.offsets[pixels]
         until = [begin + self.index.count_until(pixels, time) for time in (start, end)]
         on = _positives(self.index, until[1]) - _positives(self.index, until[0])
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
         off = until[1] - until[0] - on
-        return EventBatch(pixels, start, end, on, off, num_any=batch_size, starts_at_events=False, ahead=ahead)
+        return EventBatch(pixels, start, end, on, off, num_any=len(pixels), starts_at_events=False, ahead=ahead)
 
     def _is_on(self, until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
         """1 if the last of the first `until` events of the index is an on event, else 0."""

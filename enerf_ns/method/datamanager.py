@@ -300,7 +300,11 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         if "events" in config.supervision:
             assert config.event_pairs is not None
             blind = sensor.refractory_period if sensor.lags else None
-            events = self.pair_sampler.sample(config.event_pairs, self.generator, blind)
+            sampler, draw = self.pair_sampler, self.pair_sampler.sample
+            if self.instant_sampler is not None and isinstance(sampler, EventPairSampler) and not sampler.window:
+                # where pixels are blind, a pair begins later after an event than a pair that ends there ends
+                draw = draw if sensor.refractory_period else sampler.sample_chains
+            events = draw(config.event_pairs, self.generator, blind)
             if self.instant_sampler is not None:
                 assert config.instant_pairs is not None
                 events = events.followed_by(self.instant_sampler.sample(config.instant_pairs, self.generator))

@@ -110,6 +110,9 @@ def keep_batch(step: TrainStep, number: int, file: Path) -> None:
     """
     content = io.BytesIO()
     batch = {name: vars(part) for name, part in vars(step.batch).items() if part is not None}
+    links = step.batch.events.links if step.batch.events is not None else None
+    if links is not None:
+        batch["events"] = {**batch["events"], "links": vars(links)}
     torch.save({"step": number, "losses": step.losses, **batch}, content)
     write_whole(file, content.getvalue())
 

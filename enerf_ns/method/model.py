@@ -442,8 +442,9 @@ class EnerfModel(Model):
         if batch.events is not None:
             losses |= self.supervision.losses(start, end, batch.events, self.sensor)
             if "event_loss" in losses and "instant_loss" in losses:
-                of_events, of_any, number = losses["event_loss"], losses["instant_loss"], batch.events.num_any
-                share = 1.0 / (1.0 + self.instant_balance(of_events, batch.events.num_of_events, of_any, number))
+                of_events, of_any = losses["event_loss"], losses["instant_loss"]
+                numbers = batch.events.num_changes_of_events, batch.events.num_changes_of_any
+                share = 1.0 / (1.0 + self.instant_balance(of_events, numbers[0], of_any, numbers[1]))
                 losses |= {"event_loss": share * of_events, "instant_loss": (1.0 - share) * of_any}
             if self.training and self.sensor.threshold_map is not None:
                 self.sensor.observe(brightness_change(start, end, batch.events, self.sensor).detach(), batch.events)
@@ -458,7 +459,8 @@ class EnerfModel(Model):
             weight = config.frame_loss_weight
             if self.frame_balance and batch.events is not None and "event_loss" in losses:
                 of_events = losses["event_loss"].detach() / share / config.event_loss_weight
-                weight = share * self.frame_balance(of_events, batch.events.num_of_events, error, len(frames))
+                number = batch.events.num_changes_of_events
+                weight = share * self.frame_balance(of_events, number, error, len(frames))
             losses["frame_loss"] = (FRAME_LOSS_WEIGHT if weight is None else weight) * error
         if self.training:
             weights, samples = outputs["weights_list"], outputs["ray_samples_list"]

@@ -55,7 +55,8 @@ class EventSupervision:
         """The weighted losses of a batch, by name.
 
         These are event_loss for pairs of events, instant_loss for pairs of any instants, and no_event_loss for silent
-        pixels, each if the batch has such pairs.
+        pixels, each if the batch has such pairs. Of a chain of two pairs, all six changes between its four instants
+        count alike.
 
         Args:
             start: Brightness rendered at the first instants.
@@ -67,9 +68,20 @@ class EventSupervision:
         silent = batch.silent
         losses: dict[str, Tensor] = {}
         measured = sensor.measured_change(batch)
-        for name, pairs in (("event_loss", batch.of_events), ("instant_loss", batch.of_any)):
-            if pairs.stop > (pairs.start or 0):
-                loss = EVENT_LOSSES[self.event_loss](change[pairs], measured[pairs], sensor.mean_threshold)
+        kinds = {"event_loss": batch.of_events, "instant_loss": batch.of_any}
+        changes = {name: (change[pairs], measured[pairs]) for name, pairs in kinds.items()}
+        if (links := batch.links) is not None:
+            before = torch.cat([end[first : first + number] for first, number in batch.chains])
+            after = torch.cat([start[first + number : first + 2 * number] for first, number in batch.chains])
+            of_links = brightness_change(before, after, links, sensor), sensor.measured_change(links)
+            for name, part in (("event_loss", links.of_events), ("instant_loss", links.of_any)):
+                changes[name] = tuple(
+                    changes_of_chains(of_pairs, column[part])
+                    for of_pairs, column in zip(changes[name], of_links, strict=True)
+                )
+        for name, (rendered, reported) in changes.items():
+            if len(rendered):
+                loss = EVENT_LOSSES[self.event_loss](rendered, reported, sensor.mean_threshold)
                 losses[name] = self.event_loss_weight * loss
         if batch.num_silent:
             silence = change[silent] - measured[silent] if sensor.leaks else change[silent]
@@ -93,6 +105,18 @@ class EventSupervision:
         # the cosine of centred values; torch.corrcoef would wait for a GPU
         change, measured = change - change.mean(), measured - measured.mean()
         return {"event_correlation": cosine_similarity(change, measured, dim=0)}
+
+
+def changes_of_chains(pairs: Float[Tensor, " pairs"], links: Float[Tensor, " links"]) -> Float[Tensor, " changes"]:
+    """The six changes between the four instants of each chain, then the changes of the pairs that are in no chain.
+
+    Args:
+        pairs: Changes of pairs, of which i and n + i are the first and the last pair of a chain, for n links.
+        links: Changes from the end of the first pair of each chain to the start of its last pair.
+    """
+    first, last, alone = pairs.split([len(links), len(links), len(pairs) - 2 * len(links)])
+    begun, ended = first + links, links + last
+    return torch.cat([first, links, last, begun, ended, begun + last, alone])
 
 
 @full_precision

@@ -53,6 +53,21 @@ def test_what_is_known_beyond_the_events_stays_with_its_pairs():
     assert events(3, 0, False).followed_by(events(2, 100, True)).ahead is None
 
 
+def test_links_of_chains_are_joined_like_the_pairs_and_left_out_of_subsets():
+    of_events = replace(events(5, 0, False), links=events(2, 50, False))
+    of_any = replace(events(4, 100, False), num_any=4, links=replace(events(2, 150, False), num_any=2))
+    silent = events(2, 200, True)
+    joined = of_events.followed_by(of_any).followed_by(silent)
+    links = joined.links
+    assert links is not None and links.pixels.tolist() == [50, 51, 150, 151]
+    assert links.pixels[links.of_any].tolist() == [150, 151]
+    assert (joined.num_changes_of_events, joined.num_changes_of_any) == (5 + 2, 4 + 2)
+    assert joined.subset(joined.pixels >= 0).links is None
+    alone = events(5, 0, False).followed_by(of_any).links
+    assert alone is not None and alone.pixels.tolist() == [150, 151] and alone.num_of_events == 0
+    assert (silent.links, events(3, 0, False).num_changes_of_events) == (None, 3)
+
+
 def frames_of(pixels: int, instants: int) -> FrameBatch:
     times = torch.zeros(pixels, instants, dtype=torch.int64)
     return FrameBatch(torch.zeros(pixels, 3, dtype=torch.int64), times, torch.zeros(pixels, 3), False)

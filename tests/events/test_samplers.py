@@ -246,6 +246,60 @@ def test_events_in_small_chunks_make_the_same_pairs(mode, equal_stamps: bool, ch
     assert set(rows(drawn)) == set(expected)
 
 
+def chains(pairs: EventBatch) -> list[tuple[int, list[int]]]:
+    """Pixel and instants of each chain, which its two pairs and its link agree on."""
+    links = pairs.links
+    assert links is not None and links.links is None
+    found, number = [], len(links)
+    for first, (pixel, start, end) in zip(rows(pairs), rows(links), strict=False):
+        last = rows(pairs)[number + len(found)]
+        assert first[0] == last[0] == pixel and (first[2], last[1]) == (start, end)
+        found.append((pixel, [*first[1:], *last[1:]]))
+    return found
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("equal_stamps", [False, True])
+@pytest.mark.parametrize(("mode", "max_distance"), [("successor", 1), ("partner", 2), ("partner", 9)])
+def test_chains_are_events_of_one_pixel_in_order(mode, max_distance: int, equal_stamps: bool, gaps: bool, device: str):
+    pixels = recording(equal_stamps)
+    stretches = torch.tensor(STRETCHES, device=device) if gaps else None
+    sampler = EventPairSampler(index_of(pixels, device), mode, max_distance, stretches=stretches)
+    pairs = sampler.sample_chains(3001, torch.Generator(device).manual_seed(0))
+    assert len(pairs) == 3001 and pairs.links is not None and len(pairs.links) == 1500
+    expected = set(all_pairs(pixels, mode, max_distance, gaps))
+    assert rows(pairs)[-1] in expected, "the pair that is in no chain is one of those of sample"
+    began = Counter()
+    for pixel, instants in chains(pairs):
+        allowed = sorted({t for t, _ in pixels[pixel] if not gaps or stretch_of(t) is not None})
+        numbers = [allowed.index(t) for t in instants]
+        steps = [after - before for before, after in pairwise(numbers)]
+        assert 1 <= steps[0] <= max_distance and all(0 <= step <= max_distance for step in steps)
+        assert all(steps) or (numbers[-1] == len(allowed) - 1 and (numbers[0] == 0 or not any(steps[1:])))
+        began[pixel] += 1
+    assert len(began) == len({pixel for pixel, _, _ in expected})
+    for batch in (pairs, pairs.links):
+        for (pixel, start, end), on, off in zip(rows(batch), batch.on.tolist(), batch.off.tolist(), strict=True):
+            fired = [p for t, p in pixels[pixel] if start < t <= end]
+            assert (on, off) == (fired.count(1), fired.count(-1))
+
+
+def test_a_long_pixel_repeats_no_event_in_a_chain():
+    pixels = {3: [(START + i, 1) for i in range(40)], 4: [(START, 1), (START + 1, 1)]}
+    pairs = EventPairSampler(index_of(pixels), "partner", 10).sample_chains(4000, torch.Generator().manual_seed(0))
+    found = chains(pairs)
+    assert all(len(set(instants)) == 4 for pixel, instants in found if pixel == 3)
+    ends = [START, START + 1]
+    assert {tuple(instants) for pixel, instants in found if pixel == 4} == {(ends[0], *3 * ends[1:])}
+    assert {instants[0] for pixel, instants in found if pixel == 3} >= set(range(START, START + 30))
+
+
+def test_windows_of_time_are_in_no_chain():
+    sampler = EventPairSampler(index_of(recording(False)), "window", window_ns=WINDOW)
+    with pytest.raises(ValueError, match="chains"):
+        sampler.sample_chains(4, torch.Generator().manual_seed(0))
+
+
 @pytest.mark.parametrize("refractory", [1, 30, 5000])
 @pytest.mark.parametrize("mode", MODES)
 def test_a_pair_begins_when_the_pixel_sees_again_and_never_at_its_end(mode, refractory: int) -> None:
@@ -685,11 +739,17 @@ def test_pairs_of_any_instants_tell_what_the_events_between_add_up_to(equal_stam
     pixels = recording(equal_stamps)
     stretches = torch.tensor(STRETCHES, device=device) if gaps else None
     sampler = InstantPairSampler(index_of(pixels, device), START, END, longest, stretches)
-    batch = sampler.sample(4000, torch.Generator(device).manual_seed(0))
-    assert batch.num_silent == batch.num_of_events == 0 and batch.num_any == len(batch)
-    assert not batch.starts_at_events and batch.ahead is not None
-    rows = zip(*(column.tolist() for column in (*batch.columns, batch.ahead)), strict=True)
-    for pixel, start, end, on, off, ahead in rows:
+    batch = sampler.sample(4001, torch.Generator(device).manual_seed(0))
+    assert batch.links is not None and (len(batch), len(batch.links)) == (4001, 2000)
+    for one in (batch, batch.links):
+        assert one.num_silent == one.num_of_events == 0 and one.num_any == len(one)
+        assert not one.starts_at_events and one.ahead is not None
+    assert all(instants == sorted(instants) for _, instants in chains(batch))
+    columns = (
+        torch.cat(both).tolist()
+        for both in zip((*batch.columns, batch.ahead), (*batch.links.columns, batch.links.ahead), strict=True)
+    )
+    for pixel, start, end, on, off, ahead in zip(*columns, strict=True):
         assert START <= start <= end <= END
         assert not gaps or (stretch_of(start) is not None and stretch_of(end) is not None)
         gap = max(b[0] - a[1] for a, b in pairwise(STRETCHES)) if gaps else 0
@@ -703,7 +763,8 @@ def test_pairs_of_any_instants_tell_what_the_events_between_add_up_to(equal_stam
 def test_any_instants_are_drawn_alike_over_pixels_and_time():
     sampler = InstantPairSampler(index_of(recording(False)), START, END, 10**6)
     batch = sampler.sample(60_000, torch.Generator().manual_seed(0))
-    assert chisquare(torch.bincount(batch.pixels, minlength=WIDTH * HEIGHT)).pvalue > 1e-3
+    assert batch.links is not None
+    assert chisquare(torch.bincount(batch.links.pixels, minlength=WIDTH * HEIGHT)).pvalue > 1e-3
     times = torch.cat([batch.start, batch.end])
     assert chisquare(torch.histc(times.double(), 19, START, END + 1)).pvalue > 1e-3
     fired = (batch.on + batch.off > 0).double().mean()

@@ -11,6 +11,7 @@ import torch
 from small_runs import HEIGHT, WIDTH, set_up, small_config
 
 from enerf_ns.dataparsers.recording.files import load_image
+from enerf_ns.events.batch import EventBatch
 from enerf_ns.simulator.engine import simulate
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
@@ -169,6 +170,34 @@ def test_no_instant_that_is_paired_lies_in_what_is_held_out(recording: Path, tmp
     index, chosen = manager.index, slice(64, None)
     until = [index.count_until(events.pixels[chosen], times[chosen]) for times in (events.start, events.end)]
     assert torch.equal(until[1] - until[0], (events.on + events.off)[chosen])
+
+
+def test_pairs_are_in_chains_where_instants_are_paired_and_pixels_see_all(recording: Path, tmp_path: Path):
+    """Links begin and end with rays of their pixel, outside of what is held out."""
+
+    def drawn(**changes: Any) -> EventBatch:
+        changes = {"data__held_out_events": 0.2, **changes}
+        pipeline = set_up(small_config(recording, tmp_path, **changes)).pipeline
+        events = pipeline.datamanager.next_batch(pipeline.model.sensor).events
+        assert events is not None
+        return events
+
+    events = drawn(data__instant_pairs=33)
+    assert events.chains == ((0, 32), (64, 16)) and events.links is not None
+    for kind, (first, number) in zip((events.links.of_events, events.links.of_any), events.chains, strict=True):
+        before, after = slice(first, first + number), slice(first + number, first + 2 * number)
+        for column in (events.pixels[before], events.pixels[after]):
+            assert torch.equal(column, events.links.pixels[kind])
+        assert torch.equal(events.end[before], events.links.start[kind])
+        assert torch.equal(events.start[after], events.links.end[kind])
+    ends = torch.cat([events.links.start, events.links.end])
+    assert not held_out(ends, 0.2 - 4e-6).any()
+    for changes, chains in {
+        (("data__instant_pairs", 0),): (),
+        (("data__instant_pairs", 10), ("sensor__refractory_period_ns", 1000)): ((0, 0), (64, 5)),
+        (("data__instant_pairs", 10), ("data__pair_mode", "window"), ("data__window_ms", 50.0)): ((0, 0), (64, 5)),
+    }.items():
+        assert drawn(**dict(changes)).chains == chains
 
 
 def test_without_held_out_events_the_correlation_is_that_of_training_pairs(recording: Path, tmp_path: Path):

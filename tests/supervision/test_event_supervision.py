@@ -121,3 +121,37 @@ def test_pairs_of_any_instants_have_a_loss_of_their_own_that_is_formed_alike(nam
         expected = supervision.losses(START[part], END[part], alone, sensor())["event_loss"]
         torch.testing.assert_close(losses[loss], expected)
     assert losses["no_event_loss"] > 0 and len(losses) == 3
+
+
+@pytest.mark.parametrize("pattern", [GREY, "RGGB"])
+@pytest.mark.parametrize("name", ["huber", "squared", "normalised"])
+def test_all_six_changes_of_a_chain_count_alike(name: str, pattern: str):
+    """The batch: two chains and a pair of events, then a chain of any instants and a pair, then silent pairs. Changes
+    between instants of two pairs are written down one by one."""
+    pairs = replace(batch([False] * 8 + [True] * 4), num_any=3)
+    pixels = pairs.pixels.clone()
+    pixels[2:4], pixels[6] = pixels[:2], pixels[5]
+    pairs = replace(pairs, pixels=pixels)
+    between = {0: (2, 3, 1), 1: (3, 0, 2), 5: (6, 1, 4)}  # of the first pair of each chain: its last, on and off events
+    columns = torch.tensor([[pixels[first], 0, 0, on, off] for first, (_, on, off) in between.items()]).T
+    links = EventBatch(*columns, num_any=1)
+    supervision = EventSupervision(name, 2.0, 0.5, 0.5)
+    losses = supervision.losses(START, END, replace(pairs, links=links), sensor(pattern))
+
+    predicted, measured = changes(pairs, pattern)
+    every: dict[str, list[tuple[float, float]]] = {"event_loss": [], "instant_loss": []}
+    for i in range(8):
+        every["event_loss" if i < 5 else "instant_loss"].append((predicted[i], measured[i]))
+    for first, (last, on, off) in between.items():
+        pixel, reported = int(pixels[first]), ON * on - OFF * off
+        seen = [level(x[i], pixel, pattern) for i in (first, last) for x in (START, END)]
+        told = [0.0, measured[first], measured[first] + reported, measured[first] + reported + measured[last]]
+        for one, other in ((0, 2), (0, 3), (1, 2), (1, 3)):
+            rendered = seen[other] - seen[one], told[other] - told[one]
+            every["event_loss" if first < 5 else "instant_loss"].append(rendered)
+    for part, rendered in every.items():
+        one, other = torch.tensor(rendered).T
+        expected = 2.0 * EVENT_LOSSES[name](one, other, (ON + OFF) / 2)
+        torch.testing.assert_close(losses[part], expected, rtol=1e-4, atol=1e-5)
+    without = supervision.losses(START, END, pairs, sensor(pattern))
+    torch.testing.assert_close(losses["no_event_loss"], without["no_event_loss"])
