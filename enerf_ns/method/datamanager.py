@@ -340,6 +340,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             pixel_area=join("pixel_area"),
             metadata={DIRECTIONS_NORM: join(DIRECTIONS_NORM)},
             num_pairs=batch.num_pairs,
+            chains=() if batch.events is None else batch.events.chains,
         )
 
     def event_rays(

@@ -1,4 +1,5 @@
-"""Samplers that give both rays of a pair the same random numbers, so that their difference has no sampling noise."""
+"""Samplers that give all rays of a pair, or of a chain of two pairs, the same random numbers, so that their differences
+have less sampling noise."""
 
 from __future__ import annotations
 
@@ -24,10 +25,13 @@ class PairedRayBundle(RayBundle):
     """Rays of shape (2 * num_pairs + others): the first rays of all pairs, the second rays, then single rays."""
 
     num_pairs: int = 0
+    chains: tuple[tuple[int, int], ...] = ()
+    """Parts of the pairs that are in chains, in order: number of the first pair, and number n of the chains. Pairs i
+    and n + i of a part are in chain i."""
 
 
 def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
-    """Returns random numbers in [0, 1), one row for each ray. The two rays of a pair have the same row.
+    """Returns random numbers in [0, 1), one row for each ray. All rays of a pair or of a chain have the same row.
 
     Args:
         rays: A `PairedRayBundle`, or any other bundle, which has no pairs.
@@ -35,11 +39,13 @@ def paired_rand(rays: RayBundle, columns: int) -> Float[Tensor, "rays columns"]:
     """
     pairs = getattr(rays, "num_pairs", 0)
     drawn = torch.rand((len(rays) - pairs, columns), device=rays.origins.device)
+    for first, number in getattr(rays, "chains", ()):
+        drawn[first + number : first + 2 * number] = drawn[first : first + number]
     return torch.cat([drawn[:pairs], drawn]) if pairs else drawn
 
 
 class PairedSpacedSampler(SpacedSampler):
-    """A sampler of Nerfstudio that needs no weights. In training, both rays of a pair have the same jitter."""
+    """A sampler of Nerfstudio that needs no weights. In training, all rays of a pair or chain have the same jitter."""
 
     def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
         """Returns samples that are evenly spaced between nears and fars. In training, jitter moves their edges.
@@ -71,7 +77,8 @@ class PairedPiecewiseSampler(PairedSpacedSampler, UniformLinDispPiecewiseSampler
 
 
 class PairedPDFSampler(PDFSampler):
-    """Nerfstudio's PDFSampler without the original samples. In training, both rays of a pair have the same jitter."""
+    """Nerfstudio's PDFSampler without the original samples. In training, all rays of a pair or chain have the same
+    jitter."""
 
     def __init__(self, single_jitter: bool = False):
         super().__init__(include_original=False, single_jitter=single_jitter)

@@ -178,9 +178,10 @@ def test_pairs_are_in_chains_where_instants_are_paired_and_pixels_see_all(record
     def drawn(**changes: Any) -> EventBatch:
         changes = {"data__held_out_events": 0.2, **changes}
         pipeline = set_up(small_config(recording, tmp_path, **changes)).pipeline
-        events = pipeline.datamanager.next_batch(pipeline.model.sensor).events
-        assert events is not None
-        return events
+        batch = pipeline.datamanager.next_batch(pipeline.model.sensor)
+        assert batch.events is not None
+        assert pipeline.datamanager.rays(batch, pipeline.model.sensor).chains == batch.events.chains
+        return batch.events
 
     events = drawn(data__instant_pairs=33)
     assert events.chains == ((0, 32), (64, 16)) and events.links is not None

@@ -47,6 +47,10 @@ def paired_rays(seed: int = 0) -> PairedRayBundle:
     )
 
 
+CHAINS = ((0, 1), (3, 1))
+"""Pairs 0 and 1 are in a chain, and pairs 3 and 4."""
+
+
 def density(positions: Tensor) -> Tensor:
     """The density of a ball around the origin."""
     return torch.exp(-8.0 * positions.norm(dim=-1, keepdim=True))
@@ -82,6 +86,21 @@ def test_both_rays_of_a_pair_get_the_same_samples_and_other_rays_their_own(sampl
     assert len(starts) == 2 * PAIRS + FRAME_RAYS
     torch.testing.assert_close(starts[:PAIRS], starts[PAIRS : 2 * PAIRS], rtol=0, atol=0)
     assert len(starts.unique(dim=0)) == PAIRS + FRAME_RAYS
+
+
+@pytest.mark.parametrize("single_jitter", [False, True])
+@pytest.mark.parametrize("sample", [uniform_samples, piecewise_samples, proposal_samples])
+def test_all_four_rays_of_a_chain_get_the_same_samples(sample, single_jitter: bool):
+    """Here, where all of them are the same ray. Else a difference of two pairs would hold the noise of both."""
+    rays, place = paired_rays(), torch.arange(2 * PAIRS + FRAME_RAYS)
+    for first, last in ((0, 1), (3, 4)):
+        place[[last, PAIRS + last]] = first
+    rays = replace(rays[place], num_pairs=PAIRS, chains=CHAINS)
+    torch.manual_seed(0)
+    starts = sample(rays, single_jitter).frustums.starts[..., 0]
+    for first, last in ((0, 1), (3, 4)):
+        torch.testing.assert_close(starts[[first] * 3], starts[[last, PAIRS + first, PAIRS + last]], rtol=0, atol=0)
+    assert len(starts.unique(dim=0)) == PAIRS - len(CHAINS) + FRAME_RAYS
 
 
 @pytest.mark.parametrize("sample", [uniform_samples, piecewise_samples, proposal_samples])
@@ -131,11 +150,11 @@ def test_the_jitter_is_uniform_and_global_random_numbers_are_left_alone():
     torch.testing.assert_close(drawn[PAIRS:], expected, rtol=0, atol=0)
 
 
-def test_the_number_of_pairs_survives_collider_slice_and_device():
-    rays = paired_rays()
+def test_pairs_and_chains_survive_collider_slice_and_device():
+    rays = replace(paired_rays(), chains=CHAINS)
     collider = BoxCollider(SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])), near_plane=0.5)
     for same in (collider(rays), rays[:7], rays.to("cpu"), rays.reshape((2, -1)), rays.flatten()):
-        assert isinstance(same, PairedRayBundle) and same.num_pairs == PAIRS
+        assert isinstance(same, PairedRayBundle) and (same.num_pairs, same.chains) == (PAIRS, CHAINS)
     assert len(rays[:7]) == 7
 
 
