@@ -400,9 +400,8 @@ class InstantPairSampler:
     mean square). On average, the rest lies in the direction of the last event: `EventBatch.ahead`. Pairs without events
     are kept, too, since pairs with events alone would show too much contrast.
 
-    Two pairs are in a chain, as those of `EventPairSampler.sample_chains`: four instants of one pixel, in order. A
-    pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
-    stretches. Each other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
+    A pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
+    stretches. The other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
     instant, it is mirrored. Between two stretches, it moves to the beginning of the next stretch; after the last one,
     to its end. If pixels are blind for a while after an event, changes during that time are missing from the sum.
 
@@ -432,8 +431,14 @@ class InstantPairSampler:
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
 
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
-        """Draws `batch_size` pairs by a generator on the device of the index. Of an odd number, the last is in no
-        chain."""
+        """Draws `batch_size` pairs by a generator on the device of the index."""
+        pixels, one, _, _ = self._moments.draw(batch_size, generator)
+        return self._pairs(pixels, *torch.stack([one, self._other(one, generator)]).sort(dim=0)[0])
+
+    def sample_chains(self, batch_size: int, generator: torch.Generator) -> EventBatch:
+        """Draws `batch_size` pairs, two of them in a chain, as those of `EventPairSampler.sample_chains`: four instants
+        of one pixel, in order. Three of them are drawn near the first one. Of an odd number, one pair is in no chain.
+        """
         number = batch_size // 2
         pixels, one, _, _ = self._moments.draw(batch_size - number, generator)
         others = [self._other(one[:number], generator) for _ in range(3)]

@@ -266,7 +266,9 @@ class EnerfPipeline(VanillaPipeline):
         outputs = self._model(rays)
         if self.training and batch.events is not None and sensor.learns_lag:
             slopes = self._slopes(batch.events, SLOPE_PAIRS if step % SLOPES_EVERY == 0 else 0)
-            batch = replace(batch, events=replace(batch.events, slopes=slopes))
+            links = batch.events.links  # their rates alone would bias the delay, see `Lag.lag`
+            links = links and replace(links, slopes=slopes.new_zeros(len(links), 2))
+            batch = replace(batch, events=replace(batch.events, slopes=slopes, links=links))
         self.stopwatch.lap("render")
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)

@@ -172,11 +172,13 @@ def test_no_instant_that_is_paired_lies_in_what_is_held_out(recording: Path, tmp
     assert torch.equal(until[1] - until[0], (events.on + events.off)[chosen])
 
 
-def test_pairs_are_in_chains_where_instants_are_paired_and_pixels_see_all(recording: Path, tmp_path: Path):
+def test_pairs_are_in_chains_where_instants_are_paired_pixels_see_all_and_events_have_little_noise(
+    recording: Path, tmp_path: Path
+):
     """Links begin and end with rays of their pixel, outside of what is held out."""
 
     def drawn(**changes: Any) -> EventBatch:
-        changes = {"data__held_out_events": 0.2, **changes}
+        changes = {"data__held_out_events": 0.2, "data__max_pair_distance": 10, **changes}
         pipeline = set_up(small_config(recording, tmp_path, **changes)).pipeline
         batch = pipeline.datamanager.next_batch(pipeline.model.sensor)
         assert batch.events is not None
@@ -195,6 +197,7 @@ def test_pairs_are_in_chains_where_instants_are_paired_and_pixels_see_all(record
     assert not held_out(ends, 0.2 - 4e-6).any()
     for changes, chains in {
         (("data__instant_pairs", 0),): (),
+        (("data__instant_pairs", 10), ("data__max_pair_distance", 9)): (),
         (("data__instant_pairs", 10), ("sensor__refractory_period_ns", 1000)): ((0, 0), (64, 5)),
         (("data__instant_pairs", 10), ("data__pair_mode", "window"), ("data__window_ms", 50.0)): ((0, 0), (64, 5)),
     }.items():
