@@ -20,7 +20,7 @@ from torch import Tensor
 from tyro.conf import Fixed, OmitSubcommandPrefixes, Suppress
 from tyro.extras import subcommand_type_from_defaults
 
-from enerf_ns.choices.events import HELD_OUT_SPANS, LONGEST_DISTANCE
+from enerf_ns.choices.events import HELD_OUT_SPANS
 from enerf_ns.dataparsers.event_dataparser import EventDataParserConfig, event_data
 from enerf_ns.dataparsers.formats.registry import formats
 from enerf_ns.dataparsers.index.event_index import EventIndex
@@ -260,12 +260,6 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             self.index, *self._span, max(1, round(self.config.instants_apart_ms * 1e6)), self._stretches
         )
 
-    @property
-    def _in_chains(self) -> bool:
-        """Whether two pairs of a pixel form a chain: beside pairs of any instants, where the noise of the events leaves
-        pairs of the largest distance useful. A chain adds up more events than a pair, and with them their noise."""
-        return self.instant_sampler is not None and (self.config.max_pair_distance or 0) >= LONGEST_DISTANCE
-
     @cached_property
     def event_camera(self) -> PosedCamera:
         """The camera of the events, posed in the scene."""
@@ -308,14 +302,13 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             blind = sensor.refractory_period if sensor.lags else None
             pairs, instants = self.pair_sampler, self.instant_sampler
             draw = pairs.sample
-            if self._in_chains and isinstance(pairs, EventPairSampler) and not pairs.window:
+            if instants is not None and isinstance(pairs, EventPairSampler) and not pairs.window:
                 # where pixels are blind, a pair begins later after an event than a pair that ends there ends
                 draw = pairs.sample if sensor.refractory_period else pairs.sample_chains
             events = draw(config.event_pairs, self.generator, blind)
             if instants is not None:
                 assert config.instant_pairs is not None
-                draw = instants.sample_chains if self._in_chains else instants.sample
-                events = events.followed_by(draw(config.instant_pairs, self.generator))
+                events = events.followed_by(instants.sample_chains(config.instant_pairs, self.generator))
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)

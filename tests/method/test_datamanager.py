@@ -172,13 +172,11 @@ def test_no_instant_that_is_paired_lies_in_what_is_held_out(recording: Path, tmp
     assert torch.equal(until[1] - until[0], (events.on + events.off)[chosen])
 
 
-def test_pairs_are_in_chains_where_instants_are_paired_pixels_see_all_and_events_have_little_noise(
-    recording: Path, tmp_path: Path
-):
+def test_pairs_are_in_chains_where_instants_are_paired_and_pixels_see_all(recording: Path, tmp_path: Path):
     """Links begin and end with rays of their pixel, outside of what is held out."""
 
     def drawn(**changes: Any) -> EventBatch:
-        changes = {"data__held_out_events": 0.2, "data__max_pair_distance": 10, **changes}
+        changes = {"data__held_out_events": 0.2, **changes}
         pipeline = set_up(small_config(recording, tmp_path, **changes)).pipeline
         batch = pipeline.datamanager.next_batch(pipeline.model.sensor)
         assert batch.events is not None
@@ -197,7 +195,6 @@ def test_pairs_are_in_chains_where_instants_are_paired_pixels_see_all_and_events
     assert not held_out(ends, 0.2 - 4e-6).any()
     for changes, chains in {
         (("data__instant_pairs", 0),): (),
-        (("data__instant_pairs", 10), ("data__max_pair_distance", 9)): (),
         (("data__instant_pairs", 10), ("sensor__refractory_period_ns", 1000)): ((0, 0), (64, 5)),
         (("data__instant_pairs", 10), ("data__pair_mode", "window"), ("data__window_ms", 50.0)): ((0, 0), (64, 5)),
     }.items():
@@ -288,3 +285,16 @@ def test_evaluation_changes_nothing_of_training(recording: Path, tmp_path: Path)
         return found
 
     assert losses(evaluate=True) == losses(evaluate=False)
+
+
+def test_the_delay_of_a_lag_learns_nothing_from_the_rates_of_links(recording: Path, tmp_path: Path):
+    """Their noise favours short delays. Pairs have rendered slopes in their place."""
+    changes: dict[str, Any] = {"sensor__cutoff_frequency": 100.0, "sensor__learn_cutoff_frequency": True}
+    pipeline = set_up(small_config(recording, tmp_path, data__instant_pairs=8, **changes)).pipeline
+    pipeline.get_train_loss_dict(0)
+    links = pipeline.last_step.batch.events.links
+    assert links.rates[:32].any() and links.slopes.shape == (32 + 4, 2) and not links.slopes.any()
+    sensor = pipeline.model.sensor
+    seen = torch.full((36, 1), 0.5)
+    sensor.lag(seen, seen, links).sum().backward()
+    assert sensor.lag(seen, seen, links).any() and not sensor.delay.grad.any()
