@@ -75,10 +75,11 @@ class EventSupervision:
             after = torch.cat([start[first + number : first + 2 * number] for first, number in batch.chains])
             of_links = brightness_change(before, after, links, sensor), sensor.measured_change(links)
             for name, part in (("event_loss", links.of_events), ("instant_loss", links.of_any)):
-                changes[name] = tuple(
+                rendered, reported = (
                     changes_of_chains(of_pairs, column[part])
                     for of_pairs, column in zip(changes[name], of_links, strict=True)
                 )
+                changes[name] = rendered, reported
         for name, (rendered, reported) in changes.items():
             if len(rendered):
                 loss = EVENT_LOSSES[self.event_loss](rendered, reported, sensor.mean_threshold)

@@ -741,15 +741,13 @@ def test_pairs_of_any_instants_tell_what_the_events_between_add_up_to(equal_stam
     sampler = InstantPairSampler(index_of(pixels, device), START, END, longest, stretches)
     batch = sampler.sample_chains(4001, torch.Generator(device).manual_seed(0))
     assert batch.links is not None and (len(batch), len(batch.links)) == (4001, 2000)
+    assert all(instants == sorted(instants) for _, instants in chains(batch))
+    pairs_and_links = []
     for one in (batch, batch.links):
         assert one.num_silent == one.num_of_events == 0 and one.num_any == len(one)
         assert not one.starts_at_events and one.ahead is not None
-    assert all(instants == sorted(instants) for _, instants in chains(batch))
-    columns = (
-        torch.cat(both).tolist()
-        for both in zip((*batch.columns, batch.ahead), (*batch.links.columns, batch.links.ahead), strict=True)
-    )
-    for pixel, start, end, on, off, ahead in zip(*columns, strict=True):
+        pairs_and_links += zip(*(column.tolist() for column in (*one.columns, one.ahead)), strict=True)
+    for pixel, start, end, on, off, ahead in pairs_and_links:
         assert START <= start <= end <= END
         assert not gaps or (stretch_of(start) is not None and stretch_of(end) is not None)
         gap = max(b[0] - a[1] for a, b in pairwise(STRETCHES)) if gaps else 0

@@ -133,8 +133,9 @@ def test_all_six_changes_of_a_chain_count_alike(name: str, pattern: str):
     pixels[2:4], pixels[6] = pixels[:2], pixels[5]
     pairs = replace(pairs, pixels=pixels)
     between = {0: (2, 3, 1), 1: (3, 0, 2), 5: (6, 1, 4)}  # of the first pair of each chain: its last, on and off events
-    columns = torch.tensor([[pixels[first], 0, 0, on, off] for first, (_, on, off) in between.items()]).T
-    links = EventBatch(*columns, num_any=1)
+    rows = [[int(pixels[first]), 0, 0, on, off] for first, (_, on, off) in between.items()]
+    link, start, end, on, off = torch.tensor(rows).T
+    links = EventBatch(link, start, end, on, off, num_any=1)
     supervision = EventSupervision(name, 2.0, 0.5, 0.5)
     losses = supervision.losses(START, END, replace(pairs, links=links), sensor(pattern))
 
