@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.amp.grad_scaler import GradScaler
 
 from enerf_ns.method import trainer as enerf_trainer
+from enerf_ns.method.guarded_steps import keep_batch
 from enerf_ns.supervision.event_supervision import EVENT_LOSSES
 
 
@@ -106,7 +107,7 @@ def test_a_step_that_is_not_finite_changes_nothing(recording: Path, tmp_path: Pa
     assert kept["events"].pop("num_silent") == kept["events"].pop("num_any") == 0 and kept["events"].pop(
         "starts_at_events"
     )
-    assert all(kept["events"].pop(name) is None for name in ("rates", "ahead", "slopes"))
+    assert all(kept["events"].pop(name) is None for name in ("rates", "ahead", "slopes", "links"))
     assert {len(column) for column in kept["events"].values()} == {64}
     assert math.isfinite(kept["losses"]["event_loss"]) == ("gradient" in name)
 
@@ -126,6 +127,16 @@ def test_after_some_in_a_row_training_stops_and_the_last_checkpoint_stays(
     assert "Training is done" not in capsys.readouterr().out
     assert trainer.num_skipped == 6
     assert (trainer.checkpoint_dir / "step-000000004.ckpt").exists()
+
+
+def test_a_batch_that_is_kept_has_the_links_of_its_chains(recording: Path, tmp_path: Path):
+    pipeline = set_up(small_config(recording, tmp_path, data__instant_pairs=8)).pipeline
+    pipeline.get_train_loss_dict(0)
+    keep_batch(pipeline.last_step, 0, tmp_path / "batch.pt")
+    kept = torch.load(tmp_path / "batch.pt", weights_only=True)["events"]
+    assert len(kept["pixels"]) == 64 + 8 and torch.equal(
+        kept["links"]["pixels"], kept["pixels"][[*range(32), *range(64, 68)]]
+    )
 
 
 def test_steps_that_were_left_out_are_counted_at_the_end(recording: Path, tmp_path: Path, breaking, capsys):
