@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -115,6 +116,9 @@ class EventPairSampler:
         chain begins with a pair that is drawn as in `sample`. It is moved to an earlier event where the pixel has too
         few later events. Where it has fewer than four events in all, the last one is repeated.
 
+        Args:
+            batch_size, generator, blind_ns: As in `sample`.
+
         Raises:
             ValueError: The pairs are those of a window of time.
         """
@@ -128,16 +132,9 @@ class EventPairSampler:
         chain = torch.stack([start[:number], end[:number], end[:number] + further[0], end[:number] + further.sum(0)])
         first, last = self._offsets[pixels[:number]], self._offsets[pixels[:number] + 1] - 1
         chain = torch.minimum(chain - torch.minimum((chain[3] - last).clamp(min=0), chain[0] - first), last)
-        events = self._event(chain)
-        alone = slice(number, None)
-        pairs = _pairs_of(
-            self.index,
-            torch.cat([pixels[:number], pixels[:number], pixels[alone]]),
-            torch.cat([events[0], events[2], self._event(start[alone])]),
-            torch.cat([events[1], events[3], self._event(end[alone])]),
-            blind_ns,
-        )
-        return replace(pairs, links=_pairs_of(self.index, pixels[:number], events[1], events[2], blind_ns))
+        alone = torch.stack([start[number:], end[number:]])
+        pairs_of = partial(_pairs_of, self.index, blind_ns=blind_ns)
+        return _batch_of_chains(pairs_of, pixels, self._event(chain), self._event(alone))
 
     def _draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Numbers of random pairs, and their pixels."""
@@ -182,6 +179,26 @@ def _pairs_of(index: EventIndex, pixels: Tensor, start: Tensor, end: Tensor, bli
         rates = torch.stack([begins, rates_around(index, end, pixels, 0, blind_ns)], dim=1)
     on = (index.positives[end] - index.positives[start]).long()
     return EventBatch(pixels, index.times[start], index.times[end], on, end - start - on, rates=rates)
+
+
+def _batch_of_chains(
+    pairs_of: Callable[[Tensor, Tensor, Tensor], EventBatch],
+    pixels: Int64[Tensor, " chains_and_others"],
+    chains: Int64[Tensor, "4 chains"],
+    others: Int64[Tensor, "2 others"],
+) -> EventBatch:
+    """The first pairs of all chains, their last pairs, and the pairs that are in no chain, with the links of chains.
+
+    Args:
+        pairs_of: Makes pairs of pixels and of their first and second instants or events.
+        pixels: Pixels of the chains, then of the other pairs.
+        chains, others: Instants of each, or numbers of events, in order.
+    """
+    in_chains = pixels[: chains.shape[1]]
+    start, end = torch.cat([chains[0], chains[2], others[0]]), torch.cat([chains[1], chains[3], others[1]])
+    return replace(
+        pairs_of(torch.cat([in_chains, pixels]), start, end), links=pairs_of(in_chains, chains[1], chains[2])
+    )
 
 
 def rates_around(
@@ -437,20 +454,17 @@ class InstantPairSampler:
 
     def sample_chains(self, batch_size: int, generator: torch.Generator) -> EventBatch:
         """Draws `batch_size` pairs, two of them in a chain, as those of `EventPairSampler.sample_chains`: four instants
-        of one pixel, in order. Three of them are drawn near the first one. Of an odd number, one pair is in no chain.
+        of one pixel, in order. One is drawn uniformly, and three near it. Of an odd number, one pair is in no chain.
+
+        Args:
+            batch_size, generator: As in `sample`.
         """
         number = batch_size // 2
         pixels, one, _, _ = self._moments.draw(batch_size - number, generator)
         others = [self._other(one[:number], generator) for _ in range(3)]
         chain = torch.stack([one[:number], *others]).sort(dim=0)[0]
-        alone = slice(number, None)
-        both = torch.stack([one[alone], self._other(one[alone], generator)]).sort(dim=0)[0]
-        pairs = self._pairs(
-            torch.cat([pixels[:number], pixels[:number], pixels[alone]]),
-            torch.cat([chain[0], chain[2], both[0]]),
-            torch.cat([chain[1], chain[3], both[1]]),
-        )
-        return replace(pairs, links=self._pairs(pixels[:number], chain[1], chain[2]))
+        alone = torch.stack([one[number:], self._other(one[number:], generator)]).sort(dim=0)[0]
+        return _batch_of_chains(self._pairs, pixels, chain, alone)
 
     def _other(self, one: Int64[Tensor, " pairs"], generator: torch.Generator) -> Int64[Tensor, " pairs"]:
         """Random instants near others, in the time that is used."""
