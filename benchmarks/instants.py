@@ -3,7 +3,8 @@
 Simulates recordings of an ideal sensor, draws pairs of instants as training does, renders the true scene at both, over
 the area of each pixel and through its centre alone, and compares the changes with what the events say. Prints for each
 the correlation, and the error in contrast thresholds (root mean square), of all pairs, and how far brightness has gone
-on since the last event (`enerf_ns.events.samplers.AHEAD`).
+on since the last event (`enerf_ns.events.samplers.AHEAD`). A second table has the mean change that events tell between
+any two instants, by the true change over the area.
 
     python benchmarks/instants.py
     python benchmarks/instants.py floor clutter statue
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +32,10 @@ from enerf_ns.simulator.settings import SimulationSettings
 from enerf_ns.simulator.sources import RenderedScene
 from enerf_ns.simulator.view import view_of
 
-PAIRS, DISTANCE, APART_NS = 2500, 10, 100_000_000
+PAIRS, DISTANCE, APART_NS = 8000, 10, 100_000_000
 THRESHOLD = 0.2
+SIZES = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5, 4.0)
+"""Limits of the true changes of the second table, in thresholds."""
 CENTRE = np.tile([[0.0, 0.0]], (4, 1)) + 1e-6 * np.arange(4)[:, None]
 """Four places that are one, since the renderer takes its samples by fours."""
 
@@ -40,6 +44,7 @@ def main() -> None:
     names = sys.argv[1:] or ["shapes", "floor", "clutter"]
     print("| scene | instants | ray | correlation | error, thresholds | gone on since the last event, thresholds |")
     print("| --- | --- | --- | --- | --- | --- |")
+    of_sizes = []
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
             settings = settings_of(name, Path(folder))
@@ -64,6 +69,10 @@ def main() -> None:
                     f"{np.sqrt(np.mean((change - told) ** 2)):.2f} | {going:.2f} |".replace("| 0.00 |", "| - |"),
                     flush=True,
                 )
+                if instants == "any" and ray == "area":
+                    of_sizes.append(f"| {name} | {' | '.join(told_of_sizes(change, told))} |")
+    print("\n| scene | " + " | ".join(f"{low:g} to {high:g}" for low, high in pairwise(SIZES)) + " |")
+    print("| --- " * (len(SIZES)) + "|", *of_sizes, sep="\n")
 
 
 def settings_of(name: str, folder: Path) -> SimulationSettings:
@@ -89,6 +98,17 @@ def changes(scene: RenderedScene, settings: SimulationSettings, batch: EventBatc
     ]  # fmt: skip
     before, after = (response(brightness.astype(np.float64)) for brightness in seen)
     return after - before
+
+
+def told_of_sizes(change: np.ndarray, told: np.ndarray) -> list[str]:
+    """For true changes between each two of `SIZES`: their mean size, and the mean of what events tell in their
+    direction."""
+    found = []
+    for low, high in pairwise(SIZES):
+        chosen = (np.abs(change) >= low) & (np.abs(change) < high)
+        sizes, direction = np.abs(change[chosen]), np.sign(change[chosen])
+        found.append(f"{sizes.mean():.2f}, {(direction * told[chosen]).mean():.2f}" if chosen.any() else "-")
+    return found
 
 
 def ahead(left: np.ndarray, told: np.ndarray) -> float:
