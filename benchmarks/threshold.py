@@ -21,12 +21,14 @@ from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import method_config, train
 from enerf_ns.simulator.engine import simulate
 
+IDEAL = {name: sequence for name, sequence in {**CHOSEN_ON, **ONLY_SCORED}.items() if sequence.sensor is None}
+"""Recordings of the validation set whose sensor has no other faults."""
 SHOWN = {"psnr": 2, "ssim": 3, "depth_rmse": 3, "brightness_scale": 3}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recordings", nargs="+", choices=sorted({**CHOSEN_ON, **ONLY_SCORED}))
+    parser.add_argument("recordings", nargs="+", choices=sorted(IDEAL))
     parser.add_argument("--thresholds", nargs="+", type=float, default=[0.2, 0.1, 0.05])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=1000)
@@ -39,7 +41,9 @@ def main() -> None:
                 changes = {"max_num_iterations": arguments.steps, "pipeline.datamanager.supervision": learnt_from}
                 folder = recording(name, threshold, arguments.work)
                 found = [trained(folder, {**changes, "machine.seed": seed}) for seed in range(arguments.seeds)]
-                scores = [shown([run[score] for run in found], digits) for score, digits in SHOWN.items()]
+                scores = [
+                    shown([run[score] for run in found if score in run], digits) for score, digits in SHOWN.items()
+                ]
                 of = f"events, threshold {threshold:g}" if learnt_from == "events" else "sharp frames"
                 rows.append(f"| {name} | {of} | {' | '.join(scores)} |")
     print(
@@ -52,8 +56,7 @@ def recording(name: str, threshold: float, work: Path) -> Path:
     """Folder of a recording of the validation set, simulated once with both thresholds changed."""
     folder = work / f"{name}-{threshold:g}"
     if not folder.exists():
-        sequence = {**CHOSEN_ON, **ONLY_SCORED}[name]
-        simulate(sequence.simulation_settings(work, contrast_thresholds=(threshold, threshold)), folder)
+        simulate(IDEAL[name].simulation_settings(work, contrast_thresholds=(threshold, threshold)), folder)
     return folder
 
 
@@ -65,7 +68,9 @@ def trained(folder: Path, changes: dict[str, Any]) -> dict[str, float]:
 
 
 def shown(values: list[float], digits: int) -> str:
-    """Mean and standard deviation."""
+    """Mean and standard deviation; a dash if there is no value."""
+    if not values:
+        return "-"
     spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):.{digits}f}{spread}"
 
