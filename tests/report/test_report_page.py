@@ -117,7 +117,8 @@ def test_every_score_has_a_meaning():
     assert len(HOW_TO_READ) == len(MEANINGS) and all(meaning.endswith(".") for meaning in MEANINGS.values())
 
 
-MEASURE = """JSON.stringify({ width: innerWidth, page: document.documentElement.scrollWidth,
+MEASURE = """JSON.stringify({ loaded: document.readyState == "complete",
+    width: innerWidth, page: document.documentElement.scrollWidth,
     images: [...document.images].map(image => image.complete && image.naturalWidth > 0),
     words: document.body.innerText, background: getComputedStyle(document.body).backgroundColor,
     folded: [...document.querySelectorAll("details dl, details table")].map(part => part.checkVisibility(
@@ -138,7 +139,7 @@ def test_a_browser_shows_the_page_in_narrow_windows_and_prints_all_of_it(run: Ru
         while True:
             told = browser.call("Runtime.evaluate", expression=MEASURE, returnByValue=True)["result"].get("value")
             seen = json.loads(told or "{}")
-            if seen.get("images") and all(seen["images"]):
+            if seen.get("loaded") and seen["images"] and all(seen["images"]):
                 return seen
 
     try:
