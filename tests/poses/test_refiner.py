@@ -229,6 +229,17 @@ def test_nothing_wrong_is_left_alone(seed: int):
     assert not refiner.corrections.moves_poses
 
 
+def test_finer_pixels_alone_make_no_correction_surer():
+    """The same picture with four times as many pixels a side is rendered with the same error in radians."""
+    fine = Camera(256, 192, 240.0, 240.0, 128.0, 96.0)
+    errors = []
+    for camera in (CAMERA, fine):
+        refiner = PoseRefiner(RefinerConfig(), replace(recording(), camera=camera))
+        looks(refiner, {}, 0.01, 600)
+        errors.append([refiner.errors_of(part).max() for part in ("clock", "rotation", "translation")])
+    np.testing.assert_allclose(*errors, rtol=0.02)
+
+
 def test_what_the_scene_can_take_up_is_not_taken_for_a_wrong_pose():
     """A difference that a bent scene explains moves nothing."""
     refiner = PoseRefiner(RefinerConfig(), recording())
