@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from threshold import shown
+from threshold import LEARNT_FROM, shown
 
 from enerf_ns.bench.validation import KEYS_PER_SECOND, ONLY_SCORED
 from enerf_ns.evaluation.scores import mean_scores
@@ -46,12 +46,8 @@ def main() -> None:
         folder = arguments.work / name.replace(" ", "-")
         if not (folder / "recording").exists():
             simulate(sequence.simulation_settings(folder), folder / "recording")
-        for learnt_from in ("events", "frames"):
-            changes = {
-                "max_num_iterations": arguments.steps,
-                "pipeline.datamanager.supervision": learnt_from,
-                "evaluation_share": 0.0,
-            }
+        for learnt_from, supervision in LEARNT_FROM.items():
+            changes = {"max_num_iterations": arguments.steps, "evaluation_share": 0.0, **supervision}
             found = []
             for seed in range(arguments.seeds):
                 config = method_config(

@@ -21,6 +21,12 @@ from enerf_ns.method.held_out_views import held_out_views
 from enerf_ns.method.runs import method_config, train
 from enerf_ns.simulator.engine import simulate
 
+DATA = "pipeline.datamanager."
+LEARNT_FROM = {
+    "events": {f"{DATA}supervision": "events"},
+    "sharp frames": {f"{DATA}supervision": "frames", f"{DATA}dataparser.train_frames": "sharp"},
+}
+"""Changes to the configuration. By default, frames would be those that the exposure has blurred."""
 IDEAL = {name: sequence for name, sequence in {**CHOSEN_ON, **ONLY_SCORED}.items() if sequence.sensor is None}
 """Recordings of the validation set whose sensor has no other faults."""
 SHOWN = {"psnr": 2, "ssim": 3, "depth_rmse": 3, "brightness_scale": 3}
@@ -36,15 +42,15 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     for name in arguments.recordings:
-        for learnt_from in ("events", "frames"):
+        for learnt_from, supervision in LEARNT_FROM.items():
             for threshold in arguments.thresholds if learnt_from == "events" else arguments.thresholds[:1]:
-                changes = {"max_num_iterations": arguments.steps, "pipeline.datamanager.supervision": learnt_from}
+                changes = {"max_num_iterations": arguments.steps, **supervision}
                 folder = recording(name, threshold, arguments.work)
                 found = [trained(folder, {**changes, "machine.seed": seed}) for seed in range(arguments.seeds)]
                 scores = [
                     shown([run[score] for run in found if score in run], digits) for score, digits in SHOWN.items()
                 ]
-                of = f"events, threshold {threshold:g}" if learnt_from == "events" else "sharp frames"
+                of = f"events, threshold {threshold:g}" if learnt_from == "events" else learnt_from
                 rows.append(f"| {name} | {of} | {' | '.join(scores)} |")
     print(
         "\n| recording | trained on | PSNR, dB | SSIM | depth RMSE, m | scale |\n| --- | --- | --- | --- | --- | --- |"
