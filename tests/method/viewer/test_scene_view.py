@@ -292,9 +292,15 @@ def test_the_view_follows_the_recording(pipeline: EnerfPipeline, client: Client)
     for seconds in (0.02, 0.09):
         client.set("Time (s)", seconds)
         origin, direction = sensor_pose(pipeline, seconds)
-        wait_for(lambda place=origin: np.allclose(np.array(client.camera["position"]) / VISER_SCALE, place, atol=1e-4))
-        look = np.subtract(client.camera["look_at"], client.camera["position"])
-        assert look @ direction / np.linalg.norm(look) > 0.995, "the middle pixel is half a pixel off the axis"
+
+        def is_there(place: Any = origin, direction: Any = direction) -> bool:
+            """Position and direction, which come one after the other; the middle pixel is half a pixel off the axis."""
+            position, target = (np.array(client.camera[name]) for name in ("position", "look_at"))
+            look = target - position
+            follows = look @ direction / np.linalg.norm(look) > 0.995
+            return bool(follows and np.allclose(position / VISER_SCALE, place, atol=1e-4))
+
+        wait_for(is_there)
     view: Any = pipeline.viewer
     client.set("Follow", False)
     wait_for(lambda: not view._follows.value)
