@@ -301,6 +301,7 @@ class Bench:
         changes = {**self._changes(cell), "preset": sequence.preset}
         config = method_config(self._method(cell), self._recording(cell), self.output_dir / "runs", changes)
         config.experiment_name, config.timestamp = cell.sequence, folder.name
+        config.evaluation_share = 0.0  # a trained run is scored once, by `evaluate`
         if sequence.scene is not None and config.pipeline.model.view_direction is None:
             config.pipeline.model.view_direction = False  # simulated surfaces are matt; so all rows have the same field
         if row.factors:
@@ -415,7 +416,6 @@ def steps_of(budget: str, config: EnerfTrainerConfig) -> int:
     with tempfile.TemporaryDirectory() as folder:
         trial = copy.deepcopy(config)
         trial.output_dir, trial.max_num_iterations = Path(folder), LATE + WARM_UP + TIMED
-        trial.evaluation_share = 0.0
         trainer = set_up(trial)
         trainer.pipeline.train()
         device, times = trainer.pipeline.device, []
