@@ -52,7 +52,7 @@ def train(trainer: EnerfTrainer, device: str, steps: int, seconds: float) -> tup
 def score(trainer: EnerfTrainer) -> float:
     """PSNR over all held-out frames, dB; nan where what is rendered is flat or a negative."""
     trainer.pipeline.eval()
-    return mean_scores(held_out_views(trainer.pipeline)[0])[0].get("psnr", float("nan"))
+    return mean_scores(held_out_views(trainer.pipeline, evidence=False)[0])[0].get("psnr", float("nan"))
 
 
 def main() -> None:

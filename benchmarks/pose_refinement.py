@@ -214,7 +214,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)  # of a training that was broken off
     with redirect_stdout(sys.stderr):
         run = train(config)
-        views, _ = held_out_views(run.pipeline)
+        views, _ = held_out_views(run.pipeline, evidence=False)
         scores, _ = mean_scores(views, False, "log-affine-set", ())
         events = run.pipeline.event_scores()
     manager, refiner = run.pipeline.datamanager, run.pipeline.poses

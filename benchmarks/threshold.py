@@ -69,7 +69,7 @@ def recording(name: str, threshold: float, work: Path) -> Path:
 def trained(folder: Path, changes: dict[str, Any]) -> dict[str, float]:
     """Scores of a training over held-out frames, after the fit of brightness, and the scale of this fit."""
     run = train(method_config("enerf", folder, folder.parent / "runs", {"evaluation_share": 0.0, **changes}))
-    views, _ = held_out_views(run.pipeline)
+    views, _ = held_out_views(run.pipeline, evidence=False)
     return {**mean_scores(views, False, "log-affine-set", ())[0], **aligned_views(views)[1]}
 
 
