@@ -120,6 +120,7 @@ def test_a_result_says_what_it_was_made_of(finished: Path):
         assert result["version"] == runner.code_version() and result["device"] == runner.device_name()
         assert result["settings"]["changes"]["machine.seed"] == result["seed"] == 0
         assert set(result["scores"]) == {"log-affine-set"}
+        assert not (file.parent / "history.jsonl").exists(), "held-out frames are scored once, after training"
     assert len(list(finished.glob("runs/*/*/*/result.json"))) == 2
 
 
