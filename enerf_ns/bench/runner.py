@@ -100,7 +100,8 @@ class Bench:
         if weights is not None and not expanded(weights).is_file():
             raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
         parse_budget(settings.budget)
-        self.before = _results_of(settings.against)
+        conditions = {"experiment": name, **{what: getattr(settings, what) for what in ("budget", "scale", "method")}}
+        self.before = _results_of(settings.against, conditions)
         """Results in the file of --against; None if not given."""
         if not 0.0 < settings.scale <= 4.0:
             raise FlagError(f"--scale is {settings.scale:g}, but must be above 0 and at most 4.")
@@ -365,11 +366,11 @@ class Bench:
             ) from error
 
 
-def _results_of(against: Path | None) -> dict[str, Any] | None:
+def _results_of(against: Path | None, conditions: dict[str, Any]) -> dict[str, Any] | None:
     """The results in a result file; None if no file is given.
 
     Raises:
-        FlagError: The file has no results.
+        FlagError: The file has no results, or has results of other conditions.
     """
     if against is None:
         return None
@@ -384,6 +385,12 @@ def _results_of(against: Path | None) -> dict[str, Any] | None:
         raise FlagError(f"--against {against} holds no results of enerf bench; give a result file (.json).") from error
     if not table:
         raise FlagError(f"--against {against} holds no runs; give a result file (.json) that has some.")
+    for what, value in conditions.items():
+        if found.get(what) != value:
+            raise FlagError(
+                f"--against {against} has results of {what} {found.get(what)}, but this bench has {what} {value}; "
+                f"give a result file of the same {what}."
+            )
     return found
 
 

@@ -112,6 +112,17 @@ def test_a_row_that_lost_against_another_version_is_an_error(finished: Path, tmp
     assert "before, dB" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("what", "value"), [("experiment", "sensor"), ("budget", "1000"), ("scale", 1.0), ("method", "enerf-paper")]
+)
+def test_results_of_other_conditions_are_not_compared(finished: Path, tmp_path: Path, what: str, value: Any):
+    before = json.loads((finished / "design.json").read_text())
+    Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": finished / "design.json"}))
+    (tmp_path / "before.json").write_text(json.dumps({**before, what: value}))
+    with pytest.raises(FlagError, match=f"results of {what} {value}, but this bench has {what} {before[what]}; give a"):
+        Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": tmp_path / "before.json"}))
+
+
 def test_a_result_says_what_it_was_made_of(finished: Path):
     for file in finished.glob("runs/*/*/*/result.json"):
         result = json.loads(file.read_text())
