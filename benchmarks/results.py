@@ -84,7 +84,7 @@ LABEL_WIDTH = 112
 def benches(arguments: argparse.Namespace, seeds: int) -> dict[str, Bench]:
     """The experiments with this number of seeds, by name. Those without their recording are left out."""
     found = {}
-    for name in arguments.only or PLAN:
+    for name in arguments.only:
         settings: dict[str, Any] = {
             "scale": 0.25,
             "threads": 1,
@@ -185,7 +185,9 @@ def written(page: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Trains and scores every table of the pages.")
-    parser.add_argument("--only", nargs="*", choices=PLAN, default=[], help="experiments to run; default: all")
+    parser.add_argument(
+        "--only", nargs="*", choices=PLAN, default=list(PLAN), help="experiments to run, or none; default: all"
+    )
     parser.add_argument("--slider-depth", type=Path, help="recording slider_depth of UZH's data set")
     parser.add_argument("--reconstruction-weights", type=Path, help="weights of E2VID or FireNet")
     parser.add_argument("--output-dir", type=Path, default=ROOT / "outputs" / "results")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pose_refinement
+import pytest
 import results
 from PIL import Image
 from small_runs import SMALL_BENCH
@@ -21,7 +23,9 @@ ROOT = Path(__file__).parents[2]
 def test_every_experiment_of_the_plan_can_be_run_and_every_table_of_a_page_is_planned(tmp_path: Path):
     weights = tmp_path / "weights.pth"
     weights.touch()
-    arguments = Namespace(only=[], output_dir=tmp_path, slider_depth=tmp_path, reconstruction_weights=weights)
+    arguments = Namespace(
+        only=list(results.PLAN), output_dir=tmp_path, slider_depth=tmp_path, reconstruction_weights=weights
+    )
     benches = results.benches(arguments, 3)
     assert list(benches) == list(results.PLAN)
     assert max(cell.seed for cell in benches["shake"].cells) == 2
@@ -29,6 +33,18 @@ def test_every_experiment_of_the_plan_can_be_run_and_every_table_of_a_page_is_pl
     assert committed <= set(results.PLAN)
     arguments.slider_depth = None
     assert set(results.PLAN) - set(results.benches(arguments, 1)) == {"slider-depth"}
+
+
+def test_no_experiment_is_run_where_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As where tables of the pages are written anew from the committed results."""
+    page = tmp_path / "page.md"
+    text = (ROOT / "docs" / "results.md").read_text()
+    page.write_text(text.replace("± 0.", "± 9."))
+    monkeypatch.setattr(results, "PAGES", [page])
+    monkeypatch.setattr(sys, "argv", ["results.py", "--only", "--output-dir", str(tmp_path), "--pages"])
+    results.main()
+    assert page.read_text() == text
+    assert not (tmp_path / "runs").exists() and not (tmp_path / "recordings").exists()
 
 
 def test_the_figure_of_views_has_the_frame_and_the_render_of_each_row(finished: Path):
