@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.choices.brightness import MEAN_BRIGHTNESS
 from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.model import FOG_GROWTH, fog_growth
 from enerf_ns.rendering.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
 from enerf_ns.supervision.balance import ErrorBalance
@@ -324,3 +326,31 @@ def test_a_ray_that_misses_the_box_is_black_and_nothing(pipeline: Any):
     assert (outputs["accumulation"] == 0).all() and (outputs["rgb"] == 0).all()
     assert all(outputs[name].isfinite().all() for name in outputs)
     pipeline.train()
+
+
+@pytest.mark.parametrize(
+    ("num_steps", "begins", "ends"),
+    [(4000, 800, 2000), (2000, 400, 1000), (1999, 0, 0), (math.inf, 0, 0)],
+)
+def test_fog_is_contracted_before_half_of_a_training_that_is_not_short(num_steps: float, begins: int, ends: int):
+    """By a weight that grows by one factor a step."""
+    steps = range(5000 if math.isinf(num_steps) else int(num_steps))
+    growth = torch.tensor([fog_growth(step, num_steps) for step in steps])
+    middle = growth[begins : min(ends, len(growth))]
+    assert (growth[:begins] == 1.0).all() and (growth[ends:] == (1.0 if begins == ends else FOG_GROWTH)).all()
+    factors = middle[1:] / middle[:-1]
+    torch.testing.assert_close(factors, torch.full_like(factors, FOG_GROWTH ** (1.0 / max(ends - begins, 1))))
+
+
+@pytest.mark.parametrize("step", [800, 3999])
+@pytest.mark.parametrize("supervision", ["events", "events+frames", "frames"])
+def test_the_distortion_loss_grows_in_runs_with_events_alone(
+    recording: Path, tmp_path: Path, supervision: str, step: int
+):
+    config = small_config(recording, tmp_path, data__supervision=supervision)
+    config.max_num_iterations = 4000
+    trainer = set_up(config)
+    outputs, losses, _ = trainer.pipeline.get_train_loss_dict(step)
+    spread = distortion_loss(outputs["weights_list"][-1][..., 0], ray_samples_to_sdist(outputs["ray_samples_list"][-1]))
+    weight = 0.01 * (1.0 if supervision == "frames" or step == 800 else FOG_GROWTH)
+    torch.testing.assert_close(losses["distortion_loss"], weight * spread)
