@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Dict, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import numpy as np
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -57,13 +58,14 @@ of the depth. Of shares of 2, 5 and 10 %, this one separates depths that are rig
 FAR_SHARE = 0.75
 """Part of the accumulation of a ray that lies nearer than its far depth."""
 
-FOG_BEGINS, FOG_ENDS = 0.2, 0.5
-"""Shares of the training between which the weight of the distortion loss grows. Earlier, the depth of fog is not yet
-right, and surfaces would stay where it is wrong. Later, too few steps are left to learn brightness at the surfaces."""
+FOG_CONTRACTS = (0.2, 0.5, 0.6, 0.8)
+"""Shares of the training at which the weight of the distortion loss begins to grow, is largest, begins to fall, and is
+as before. Earlier, the depth of fog is not yet right, and surfaces would stay where it is wrong. Later, too few steps
+are left to learn brightness at the surfaces."""
 
 FEWEST_STEPS = 2000
-"""Fewest steps of a training in which that weight grows. In shorter ones, brightness is not learned anew at the surfaces
-where the sensor has faults."""
+"""Fewest steps of a training in which that weight grows. In shorter ones, brightness is not learned anew at the
+surfaces where the sensor has faults."""
 
 FOG_GROWTH = 30.0
 """Factor by which the weight of the distortion loss grows. Runs without events keep the weight, since their losses have
@@ -153,7 +155,7 @@ class EnerfModelConfig(ModelConfig):
     background. Default: 0 where the border of the sensor is silent, else 1."""
     distortion_loss_weight: float = 0.01
     """Weight of the distortion loss of mip-NeRF 360, which contracts fog to surfaces. With events, it grows to 30 times
-    this value between a fifth and half of a training of at least 2000 steps."""
+    this value between a fifth and half of a training of at least 2000 steps, and falls again until four fifths."""
     interlevel_loss_weight: float = 1.0
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     edge_start: bool = False
@@ -202,12 +204,11 @@ class BoxCollider(AABBBoxCollider):
 
 
 def fog_growth(step: int, num_steps: float) -> float:
-    """Factor of the weight of the distortion loss at a step of a training of `num_steps` steps: from 1 to `FOG_GROWTH`,
-    evenly in its logarithm."""
+    """Factor of the weight of the distortion loss at a step of a training of `num_steps` steps: between 1 and
+    `FOG_GROWTH`, even in its logarithm between the shares of `FOG_CONTRACTS`."""
     if not FEWEST_STEPS <= num_steps < math.inf:
         return 1.0
-    share = (step / num_steps - FOG_BEGINS) / (FOG_ENDS - FOG_BEGINS)
-    return FOG_GROWTH ** min(max(share, 0.0), 1.0)
+    return FOG_GROWTH ** float(np.interp(step / num_steps, FOG_CONTRACTS, (0.0, 1.0, 1.0, 0.0)))
 
 
 class Outputs(dict[str, Any]):

@@ -328,21 +328,24 @@ def test_a_ray_that_misses_the_box_is_black_and_nothing(pipeline: Any):
     pipeline.train()
 
 
-@pytest.mark.parametrize(
-    ("num_steps", "begins", "ends"),
-    [(4000, 800, 2000), (2000, 400, 1000), (1999, 0, 0), (math.inf, 0, 0)],
-)
-def test_fog_is_contracted_before_half_of_a_training_that_is_not_short(num_steps: float, begins: int, ends: int):
-    """By a weight that grows by one factor a step."""
-    steps = range(5000 if math.isinf(num_steps) else int(num_steps))
-    growth = torch.tensor([fog_growth(step, num_steps) for step in steps])
-    middle = growth[begins : min(ends, len(growth))]
-    assert (growth[:begins] == 1.0).all() and (growth[ends:] == (1.0 if begins == ends else FOG_GROWTH)).all()
-    factors = middle[1:] / middle[:-1]
-    torch.testing.assert_close(factors, torch.full_like(factors, FOG_GROWTH ** (1.0 / max(ends - begins, 1))))
+@pytest.mark.parametrize("num_steps", [2000, 4000])
+def test_fog_is_contracted_in_the_middle_of_a_training(num_steps: int):
+    """By a weight that grows by one factor a step, stays, and falls by one factor a step."""
+    growth = torch.tensor([fog_growth(step, num_steps) for step in range(num_steps)])
+    begins, grown, falls, fallen = (num_steps * share // 10 for share in (2, 5, 6, 8))
+    assert (growth[: begins + 1] == 1.0).all() and (growth[grown : falls + 1] == FOG_GROWTH).all()
+    assert (growth[fallen:] == 1.0).all()
+    for part, end in ((growth[begins : grown + 1], FOG_GROWTH), (growth[falls : fallen + 1], 1.0 / FOG_GROWTH)):
+        factors = part[1:] / part[:-1]
+        torch.testing.assert_close(factors, torch.full_like(factors, end ** (1.0 / len(factors))))
 
 
-@pytest.mark.parametrize("step", [800, 3999])
+@pytest.mark.parametrize("num_steps", [1999, math.inf])
+def test_fog_is_not_contracted_in_short_trainings_nor_in_those_without_an_end(num_steps: float):
+    assert {fog_growth(step, num_steps) for step in range(1999)} == {1.0}
+
+
+@pytest.mark.parametrize("step", [800, 2000])
 @pytest.mark.parametrize("supervision", ["events", "events+frames", "frames"])
 def test_the_distortion_loss_grows_in_runs_with_events_alone(
     recording: Path, tmp_path: Path, supervision: str, step: int
