@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Dict, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import numpy as np
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -55,6 +57,19 @@ of the depth. Of shares of 2, 5 and 10 %, this one separates depths that are rig
 
 FAR_SHARE = 0.75
 """Part of the accumulation of a ray that lies nearer than its far depth."""
+
+FOG_CONTRACTS = (0.2, 0.5, 0.6, 0.8)
+"""Shares of the training at which the weight of the distortion loss begins to grow, is largest, begins to fall, and is
+as before. Earlier, the depth of fog is not yet right, and surfaces would stay where it is wrong. Later, too few steps
+are left to learn brightness at the surfaces."""
+
+FEWEST_STEPS = 2000
+"""Fewest steps of a training in which that weight grows. In shorter ones, brightness is not learned anew at the
+surfaces where the sensor has faults."""
+
+FOG_GROWTH = 30.0
+"""Factor by which the weight of the distortion loss grows. Runs without events keep the weight, since their losses have
+another scale."""
 
 FARTHEST = 1000.0
 """Far end of the rays where space is contracted, in scene units (halves of the longest side of the box)."""
@@ -139,7 +154,8 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the light that passes through the scene, 1 minus accumulation; 0 for an object before an empty
     background. Default: 0 where the border of the sensor is silent, else 1."""
     distortion_loss_weight: float = 0.01
-    """Weight of the distortion loss of mip-NeRF 360, which contracts fog to surfaces."""
+    """Weight of the distortion loss of mip-NeRF 360, which contracts fog to surfaces. With events, it grows to 30 times
+    this value between a fifth and half of a training of at least 2000 steps, and falls again until four fifths."""
     interlevel_loss_weight: float = 1.0
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     edge_start: bool = False
@@ -187,6 +203,14 @@ class BoxCollider(AABBBoxCollider):
         return ray_bundle
 
 
+def fog_growth(step: int, num_steps: float) -> float:
+    """Factor of the weight of the distortion loss at a step of a training of `num_steps` steps: between 1 and
+    `FOG_GROWTH`, even in its logarithm between the shares of `FOG_CONTRACTS`."""
+    if not FEWEST_STEPS <= num_steps < math.inf:
+        return 1.0
+    return FOG_GROWTH ** float(np.interp(step / num_steps, FOG_CONTRACTS, (0.0, 1.0, 1.0, 0.0)))
+
+
 class Outputs(dict[str, Any]):
     """Outputs of a render by name. A value that is a function is computed when it is first read by its name."""
 
@@ -203,6 +227,8 @@ class EnerfModel(Model):
     config: EnerfModelConfig
     samples_at_once: int | None = None
     """Largest number of samples at which the field is evaluated at once; None for all (`enerf_ns.method.memory`)."""
+    fog_growth: float = 1.0
+    """Present factor of the weight of the distortion loss in runs with events."""
     seen_volume: Callable[[], SeenVolume] | None = None
     """Returns the volume that the camera of the events saw; None for a model without a recording."""
     display: Callable[[Tensor], Tensor] | None = None
@@ -468,7 +494,8 @@ class EnerfModel(Model):
                 losses["opacity_loss"] = config.opacity_loss_weight * (1.0 - outputs["accumulation"]).mean()
             if config.distortion_loss_weight:
                 spread = distortion_loss(weights[-1][..., 0], ray_samples_to_sdist(samples[-1]))
-                losses["distortion_loss"] = config.distortion_loss_weight * spread
+                growth = 1.0 if batch.events is None else self.fog_growth
+                losses["distortion_loss"] = growth * config.distortion_loss_weight * spread
             if self.proposal is not None:
                 losses["interlevel_loss"] = config.interlevel_loss_weight * interlevel_loss(weights, samples)
         return losses

@@ -34,7 +34,7 @@ from enerf_ns.events.batch import EventBatch, TrainBatch
 from enerf_ns.method.datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.method.held_out_views import held_out_view, held_out_views, scores_at_stated_poses
 from enerf_ns.method.memory import SMALL_STEP, free_bytes, step_cost
-from enerf_ns.method.model import EnerfModel, EnerfModelConfig
+from enerf_ns.method.model import EnerfModel, EnerfModelConfig, fog_growth
 from enerf_ns.method.stopwatch import Stopwatch
 from enerf_ns.method.viewer.guard import guard_viser
 from enerf_ns.poses.refiner import (
@@ -259,6 +259,7 @@ class EnerfPipeline(VanillaPipeline):
             self._start_from_edges()
         if self.training and step == LAG_TOLD_AFTER and (left_out := sensor.leave_out_small_lag()):
             say(left_out)
+        self.model.fog_growth = fog_growth(step, self.num_steps)
         batch = self.datamanager.next_batch(sensor)
         self.stopwatch.lap("draw")
         rays = self.datamanager.rays(batch, sensor)

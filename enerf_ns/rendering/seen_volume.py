@@ -23,8 +23,9 @@ voxel of a face of a cubic box."""
 NUM_EVENTS = 20_000
 """Largest number of events that find the places that events come from."""
 
-FEW_EVENTS = 0.02
-"""Number of events, relative to `SeenVolume.mean_events`, at which `SeenVolume.evidence` is 0.5."""
+FEW_EVENTS = 0.1
+"""Number of events, relative to `SeenVolume.mean_events`, at which `SeenVolume.evidence` is 0.5. A field that
+contracts fog is thin at untextured surfaces, too: only events tell where its depth is right."""
 
 STEPS_A_VOXEL = 2
 """Number of points on a ray, for each length of a voxel's side, whose voxels count as passed."""

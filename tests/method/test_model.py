@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from small_runs import EVENTS, check_two_steps, set_up, small_config
 
 from enerf_ns.choices.brightness import MEAN_BRIGHTNESS
 from enerf_ns.method.held_out_views import held_out_views
+from enerf_ns.method.model import FOG_GROWTH, fog_growth
 from enerf_ns.rendering.ray_samplers import PairedUniformSampler
 from enerf_ns.sensor.response import linlog, luma
 from enerf_ns.supervision.balance import ErrorBalance
@@ -324,3 +326,34 @@ def test_a_ray_that_misses_the_box_is_black_and_nothing(pipeline: Any):
     assert (outputs["accumulation"] == 0).all() and (outputs["rgb"] == 0).all()
     assert all(outputs[name].isfinite().all() for name in outputs)
     pipeline.train()
+
+
+@pytest.mark.parametrize("num_steps", [2000, 4000])
+def test_fog_is_contracted_in_the_middle_of_a_training(num_steps: int):
+    """By a weight that grows by one factor a step, stays, and falls by one factor a step."""
+    growth = torch.tensor([fog_growth(step, num_steps) for step in range(num_steps)])
+    begins, grown, falls, fallen = (num_steps * share // 10 for share in (2, 5, 6, 8))
+    assert (growth[: begins + 1] == 1.0).all() and (growth[grown : falls + 1] == FOG_GROWTH).all()
+    assert (growth[fallen:] == 1.0).all()
+    for part, end in ((growth[begins : grown + 1], FOG_GROWTH), (growth[falls : fallen + 1], 1.0 / FOG_GROWTH)):
+        factors = part[1:] / part[:-1]
+        torch.testing.assert_close(factors, torch.full_like(factors, end ** (1.0 / len(factors))))
+
+
+@pytest.mark.parametrize("num_steps", [1999, math.inf])
+def test_fog_is_not_contracted_in_short_trainings_nor_in_those_without_an_end(num_steps: float):
+    assert {fog_growth(step, num_steps) for step in range(1999)} == {1.0}
+
+
+@pytest.mark.parametrize("step", [800, 2000])
+@pytest.mark.parametrize("supervision", ["events", "events+frames", "frames"])
+def test_the_distortion_loss_grows_in_runs_with_events_alone(
+    recording: Path, tmp_path: Path, supervision: str, step: int
+):
+    config = small_config(recording, tmp_path, data__supervision=supervision)
+    config.max_num_iterations = 4000
+    trainer = set_up(config)
+    outputs, losses, _ = trainer.pipeline.get_train_loss_dict(step)
+    spread = distortion_loss(outputs["weights_list"][-1][..., 0], ray_samples_to_sdist(outputs["ray_samples_list"][-1]))
+    weight = 0.01 * (1.0 if supervision == "frames" or step == 800 else FOG_GROWTH)
+    torch.testing.assert_close(losses["distortion_loss"], weight * spread)
