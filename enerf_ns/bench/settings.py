@@ -31,7 +31,8 @@ class BenchSettings:
     threads: Optional[int] = None  # noqa: UP045
     """Number of CPU threads. Default: the number of CPU cores."""
     against: Optional[Path] = None  # noqa: UP045
-    """Result file (.json) of another version. The change of the PSNR of each row since that version is shown, largest
-    loss first. The exit code is not 0 if a row lost more than 0.3 dB."""
+    """Result file (.json) of another version, of the same experiment, budget, scale and method. The change of the PSNR
+    of each row since that version is shown, largest loss first. The exit code is not 0 if a row lost more than 0.3
+    dB."""
     output_dir: Path = Path("outputs/bench")
     """Folder for the tables, recordings and runs. Runs that are finished there are not run again."""
