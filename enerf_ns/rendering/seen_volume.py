@@ -27,6 +27,13 @@ FEW_EVENTS = 0.1
 """Number of events, relative to `SeenVolume.mean_events`, at which `SeenVolume.evidence` is 0.5. A field that
 contracts fog is thin at untextured surfaces, too: only events tell where its depth is right."""
 
+OUTLINE = 2
+"""Distance in pixels up to which the ray of an event passes the outline of an object. There, events come from the
+object, and not from what it hides."""
+
+STEP = 0.1
+"""Share of the depth by which an outline stands before what it hides; smaller steps are those of curved surfaces."""
+
 STEPS_A_VOXEL = 2
 """Number of points on a ray, for each length of a voxel's side, whose voxels count as passed."""
 
@@ -45,7 +52,8 @@ class SeenVolume:
     is_seen: Bool[Tensor, "x y z"]
     """Whether each voxel was seen."""
     num_events: Float[Tensor, "x y z"]
-    """Number of events of the whole recording whose rays end in the voxel or in one of its 26 neighbours."""
+    """Number of events of the whole recording that came from the voxel or one of its 26 neighbours. An event came from
+    the end of its ray, or from as near as a surface `OUTLINE` pixels beside it."""
     mean_events: float
     """Mean of `num_events` over the surfaces that the camera sees, with equal weight for each pixel."""
 
@@ -71,9 +79,15 @@ class SeenVolume:
         events = index.events(at_most=NUM_EVENTS)
         share = len(events) / len(index)
         posed = torch.from_numpy(~recording.in_left_out_gaps(events.t))
-        event_pixels = torch.from_numpy(events.y.astype(int) * width + events.x)[posed]
-        pixels = torch.cat([y * width + x, event_pixels]).to(device)
-        rays = camera.rays(pixels, torch.cat([times, torch.from_numpy(events.t)[posed]]).to(device))
+        event_x, event_y, event_times = (
+            torch.from_numpy(column.astype(int))[posed] for column in (events.x, events.y, events.t)
+        )
+        around = [
+            (event_y + OUTLINE * down).clamp(0, height - 1) * width + (event_x + OUTLINE * right).clamp(0, width - 1)
+            for right, down in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        pixels = torch.cat([y * width + x, *around]).to(device)
+        rays = camera.rays(pixels, torch.cat([times, event_times.repeat(len(around))]).to(device))
 
         was_training = model.training
         model.train(False)
@@ -84,11 +98,15 @@ class SeenVolume:
 
         shape = grid_shape(aabb)
         voxel = float((aabb[1] - aabb[0]).max()) / VOXELS
-        looks, ends = rays[:NUM_RAYS], rays.origins + rays.directions * depths
+        looks, of_events = rays[:NUM_RAYS], rays[NUM_RAYS : NUM_RAYS + len(event_times)]
         assert looks.nears is not None
         is_seen = voxels_on_rays(aabb, shape, looks.origins, looks.directions, looks.nears, depths[:NUM_RAYS] + voxel)
-        volume = cls(aabb, is_seen, sum_of_neighbours(points_per_voxel(aabb, shape, ends[NUM_RAYS:])) / share, 0.0)
-        return replace(volume, mean_events=float(volume.events(ends[:NUM_RAYS]).mean()))
+        came_from = of_events.origins + of_events.directions * before_outlines(
+            depths[NUM_RAYS:].view(len(around), -1, 1)
+        )
+        volume = cls(aabb, is_seen, sum_of_neighbours(points_per_voxel(aabb, shape, came_from)) / share, 0.0)
+        seen_at = looks.origins + looks.directions * depths[:NUM_RAYS]
+        return replace(volume, mean_events=float(volume.events(seen_at).mean()))
 
     def seen(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
         """Returns whether points, in scene units, lie in voxels that were seen."""
@@ -107,6 +125,22 @@ class SeenVolume:
         """
         events = self.events(points)
         return events / (events + max(FEW_EVENTS * self.mean_events, 1e-6))
+
+
+def before_outlines(depths: Float[Tensor, "5 events 1"]) -> Float[Tensor, "events 1"]:
+    """Returns the depths that events came from: at an outline that of the object, elsewhere that of the event's ray.
+
+    Inverse depth is linear over the picture of a plane. At an outline it has a step, so that the mean of two opposite
+    neighbours is above the value between them on the side of what is hidden.
+
+    Args:
+        depths: Depth of the ray of each event and of its neighbours: right, left, below, above. 0 is that of a ray
+            that meets nothing.
+    """
+    inverse = torch.where(depths > 0.0, 1.0 / depths, 0.0)
+    own, right, left, below, above = inverse
+    bends = torch.maximum(right + left, below + above) - 2.0 * own
+    return torch.where(bends > STEP * own, 1.0 / inverse.amax(0), depths[0])
 
 
 def grid_shape(aabb: Float[Tensor, "2 3"]) -> torch.Size:

@@ -16,8 +16,10 @@ from small_runs import set_up, small_config
 from enerf_ns.method.model import BoxCollider
 from enerf_ns.rendering.seen_volume import (
     FEW_EVENTS,
+    OUTLINE,
     STEPS_A_VOXEL,
     SeenVolume,
+    before_outlines,
     grid_shape,
     points_per_voxel,
     sum_of_neighbours,
@@ -148,3 +150,48 @@ def test_evidence_is_half_at_few_events_and_grows_with_their_number():
     evidence = volume.evidence(centres).tolist()
     assert evidence[:2] == pytest.approx([0.0, 0.5])
     assert evidence[2] == pytest.approx(1.0 / (1.0 + FEW_EVENTS)) and evidence[2] < evidence[3] < 1.0
+
+
+def _around(depth_at: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Depths at pixels and `OUTLINE` pixels beside them, as `before_outlines` takes them."""
+    steps = ((0, 0), (OUTLINE, 0), (-OUTLINE, 0), (0, OUTLINE), (0, -OUTLINE))
+    return torch.stack([depth_at(x + right, y + down) for right, down in steps])[..., None]
+
+
+def test_events_beside_an_outline_come_from_what_hides():
+    """A disc of depth 1 before a wall of depth 3."""
+
+    def depth_at(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return torch.where((x - 50.0) ** 2 + (y - 50.0) ** 2 <= 20.0**2, 1.0, 3.0)
+
+    y, x = (grid.flatten() for grid in torch.meshgrid(*2 * [torch.arange(100.0)], indexing="ij"))
+    came_from = before_outlines(_around(depth_at, x, y))[:, 0]
+    distance = ((x - 50.0) ** 2 + (y - 50.0) ** 2).sqrt() - 20.0
+    torch.testing.assert_close(came_from[distance < 0.5 * OUTLINE].unique(), torch.tensor([1.0]))
+    assert (came_from[distance > OUTLINE] == 3.0).all()
+
+
+def test_events_beside_an_object_before_nothing_come_from_the_object():
+    depths = torch.tensor([[0.0, 2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 2.0, 2.0]]).T
+    assert before_outlines(depths[..., None])[:, 0].tolist() == [2.0, 0.0, 2.0]
+
+
+def test_events_of_a_slanted_plane_and_of_a_ball_come_from_their_rays():
+    """Of the ball without its outline, at which depth is steep."""
+    focal = 100.0
+    y, x = (grid.flatten() for grid in torch.meshgrid(*2 * [torch.arange(100.0)], indexing="ij"))
+
+    def plane(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return 1.0 / (0.3 + 0.01 * (y - 20.0).clamp(min=0.0) + 0.001 * x)  # a floor that runs to a wall
+
+    def ball(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        ray = torch.stack([(x - 50.0) / focal, (y - 50.0) / focal, torch.ones_like(x)], dim=-1)
+        squared, along = (ray**2).sum(-1), 2.0 * ray[..., 2]  # centre at depth 2, radius 0.8
+        root = (along**2 - squared * (4.0 - 0.8**2)).clamp(min=0.0).sqrt()
+        return (along - root) / squared
+
+    inside = (x - 50.0) ** 2 + (y - 50.0) ** 2 < 35.0**2
+    for depth_at, chosen in ((plane, torch.ones_like(inside)), (ball, inside)):
+        torch.testing.assert_close(
+            before_outlines(_around(depth_at, x, y))[chosen][:, 0], depth_at(x, y)[chosen], rtol=0.0, atol=0.0
+        )
