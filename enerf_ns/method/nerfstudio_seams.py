@@ -109,13 +109,13 @@ SEAMS = (
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn", "rendering.ray_samplers spaces samples as Nerfstudio does"),
     Seam(f"{_SAMPLERS}:SpacedSampler.spacing_fn_inv", "rendering.ray_samplers spaces samples as Nerfstudio does"),
     *(Seam(f"{_RENDERER}.{name}", "method.viewer.view_renderer") for name in ("check_interrupt", "client")),
-    *(Seam(f"{_RENDERER}.{name}", "replace_renderer, stop_renderers") for name in ("running", "render_trigger")),
+    *(Seam(f"{_RENDERER}.{name}", "replace_renderer") for name in ("running", "render_trigger")),
     *(
         Seam(f"nerfstudio.viewer_legacy.server.viewer_utils:{name}", "method.viewer.view_renderer interrupts a render")
         for name in ("SetTrace", "IOChangeException")
     ),
     Seam("nerfstudio.viewer.viewer:Viewer.make_stats_markdown", "method.viewer.view_renderer says the step"),
-    Seam("nerfstudio.viewer.viewer:Viewer.render_statemachines", "replace_renderer, stop_renderers, scene_view"),
+    Seam("nerfstudio.viewer.viewer:Viewer.render_statemachines", "replace_renderer, method.viewer.scene_view"),
     *(
         Seam(f"nerfstudio.viewer.viewer:Viewer.{name}", "method.viewer.scene_view")
         for name in ("last_move_time", "stats_markdown", "pause_train", "resume_train")
@@ -206,10 +206,6 @@ def leave_out_fused_step(optimizer: torch.optim.Optimizer, left_out: Tensor) -> 
     optimizer.grad_scale = None  # type: ignore[attr-defined]
 
 
-LONGEST_RENDER = 10.0
-"""Seconds that the end of a command waits for a picture that is being rendered."""
-
-
 def tidy_control_panel(panel: ControlPanel, max_width: int) -> None:
     """Sets "Max res" (pixels), and hides the controls that have no effect.
 
@@ -231,20 +227,6 @@ def replace_renderer(viewer: Viewer, client: ClientHandle, renderer: RenderState
     own.running = False
     own.render_trigger.set()  # for which it waits
     viewer.render_statemachines[client.client_id] = renderer
-
-
-def stop_renderers(viewer: Viewer) -> None:
-    """Stops the threads that render for browsers, and waits for what they render.
-
-    Python ends while such a thread computes by aborting the process (SIGABRT, "terminate called without an active
-    exception"), since Nerfstudio 1.1.5 never stops them.
-    """
-    renderers = list(viewer.render_statemachines.values())
-    for renderer in renderers:
-        renderer.running = False
-        renderer.render_trigger.set()  # for which it waits
-    for renderer in renderers:
-        renderer.join(LONGEST_RENDER)
 
 
 def replace_camera_callbacks(client: ClientHandle, callback: Callable[[CameraHandle], None]) -> None:

@@ -67,7 +67,7 @@ from enerf_ns.method.guarded_steps import (
     why_nothing_is_learnt,
 )
 from enerf_ns.method.model import EnerfModel
-from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters, stop_renderers
+from enerf_ns.method.nerfstudio_seams import flush_tensorboard, sampler_counters, set_sampler_counters
 from enerf_ns.method.origin import ORIGIN_FILE, origin
 from enerf_ns.method.pipeline import EnerfPipeline, EnerfPipelineConfig, TrainStep
 from enerf_ns.method.probe import view_direction_gain
@@ -610,7 +610,6 @@ class EnerfTrainer(Trainer):
                     time.sleep(1.0)
         elif looked_at:
             time.sleep(0.5)  # in which viser sends the sentence
-        stop_renderers(viewer)
 
     def _after_train(self) -> None:
         self.step = self._trained  # Nerfstudio has counted one step more where training was stopped

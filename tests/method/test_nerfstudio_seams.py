@@ -5,20 +5,15 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-import threading
-import time
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import nerfstudio
 import pytest
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from enerf_ns.method import nerfstudio_seams
-from enerf_ns.method.nerfstudio_seams import READ_IN, SEAMS, Seam, stop_renderers
+from enerf_ns.method.nerfstudio_seams import READ_IN, SEAMS, Seam
 from enerf_ns.terminal import CHATTER
 
 
@@ -88,25 +83,3 @@ def test_no_private_attribute_of_another_package_is_used_without_a_seam():
     listed = {seam.place.rpartition(".")[2] for seam in SEAMS}
     documented = {"_target", "_exit", "_replace"}  # of Nerfstudio's configs, of os, of named tuples
     assert used - own - listed - documented == set()
-
-
-def test_when_a_command_ends_no_thread_renders_any_more():
-    """Threads of Nerfstudio's class, one of which waits for a browser and one of which is in a picture."""
-    begun, finished = threading.Event(), []
-
-    class Renders(RenderStateMachine):
-        def run(self) -> None:
-            begun.set()
-            time.sleep(0.3)
-            finished.append(self)
-
-    viewer: Any = SimpleNamespace(ready=True, get_camera_state=lambda client: None, render_statemachines={})
-    client: Any = SimpleNamespace(client_id=0)
-    machines = [RenderStateMachine(viewer, 1.0, client), Renders(viewer, 1.0, client)]
-    viewer.render_statemachines.update(enumerate(machines))
-    for machine in machines:
-        machine.start()
-    begun.wait()
-    stop_renderers(viewer)
-    assert not any(machine.is_alive() for machine in machines) and finished == machines[1:]
-    stop_renderers(viewer)  # again, at no cost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import itertools
 import threading
@@ -42,6 +43,9 @@ TRAINING_SHARE = 9.0
 
 SECONDS_TO_ARRIVE = 2.0
 """Time after connecting in which a browser may still report the pose at which it opens by itself."""
+
+LONGEST_RENDER = 10.0
+"""Time (s) that the end of a command waits for a picture that is being rendered."""
 
 
 class ViewRenderer(RenderStateMachine):
@@ -93,7 +97,22 @@ class ViewRenderer(RenderStateMachine):
         before, self._pose = self._pose, pose
         return not np.array_equal(before, pose)
 
+    def stop(self) -> None:
+        """Ends the thread, and the picture that it renders."""
+        self.running = False
+        self._asked = next(self._requests)
+        self.render_trigger.set()
+        self.join(LONGEST_RENDER)
+
     def run(self) -> None:
+        # Python ends beside a thread that computes by aborting ("terminate called without an active exception")
+        atexit.register(self.stop)
+        try:
+            self._render_views()
+        finally:
+            atexit.unregister(self.stop)
+
+    def _render_views(self) -> None:
         size, again = 0, 0.0
         while self.running:
             self.render_trigger.wait(0.2 if size == SIZES else 0.05)

@@ -494,3 +494,35 @@ def likeness(shown: np.ndarray, frame: np.ndarray) -> float:
             found = cv2.matchTemplate(shown.astype(np.float32), small, cv2.TM_CCOEFF_NORMED)
             best = max(best, float(found.max()))
     return best
+
+
+ENDS_BESIDE_A_RENDER = """
+import threading
+from types import SimpleNamespace
+import numpy as np, torch
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
+from enerf_ns.method.viewer.view_renderer import ViewRenderer
+
+begun = threading.Event()
+
+class Renderer(ViewRenderer):
+    def _draw(self, size):
+        begun.set()
+        while self._asked == self._drawn:
+            torch.randn(300, 300) @ torch.randn(300, 300)
+        print("left its picture", flush=True)
+        raise IOChangeException
+
+client = SimpleNamespace(client_id=0, camera=SimpleNamespace(position=np.zeros(3)))
+panel = SimpleNamespace(content="")
+viewer = SimpleNamespace(ready=True, step=0, make_stats_markdown=lambda *_: "", stats_markdown=panel)
+renderer = Renderer(viewer, client, threading.Lock(), 1.0, None, None)
+client.camera.position = np.ones(3)
+renderer.start()
+begun.wait()
+"""
+
+
+def test_a_command_that_ends_while_a_picture_is_rendered_waits_for_the_thread():
+    done = subprocess.run([sys.executable, "-c", ENDS_BESIDE_A_RENDER], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "left its picture\n"), done.stderr
