@@ -190,10 +190,9 @@ def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]
     if growth is None:
         return None
     square, error = growth.values[2], growth.errors[2]
-    share = square * growth.squares / growth.variance
-    if square < SIGNIFICANT * error or share < LEAST_GROWTH:
+    if not square > SIGNIFICANT * error or square * growth.squares < LEAST_GROWTH * growth.variance:
         return None
-    spread = math.sqrt(square)
+    spread, share = math.sqrt(square), square * growth.squares / growth.variance
     why = (
         f"the sums of {growth.longest} successive events of a pixel vary by {growth.variance:.3g} squared thresholds, "
         f"{100 * share:.0f} % of it in step with the square of their number"

@@ -196,6 +196,15 @@ def test_the_counts_of_both_polarities_tell_the_ratio_and_the_mean_is_assumed(tm
     assert 0 < on.error < 0.02 and 0 < off.error < 0.02
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("polarity", [True, False])
+def test_events_of_one_polarity_show_no_spread_of_thresholds(polarity: bool):
+    """All sums of as many events are equal, so that there is no variance to divide by."""
+    times = 10**9 + np.cumsum(np.random.default_rng(3).integers(10**6, 10**7, (500, 100)), axis=1)
+    index = index_of(times, np.full(times.shape, polarity))
+    assert refractory_period(index) is None and threshold_spread(index, (0.25, 0.25)) is None
+
+
 def test_counts_of_a_blind_sensor_tell_nothing(tmp_path: Path):
     recording = recording_of(events_of_waves((0.14, 0.1), 1.0, 20_000_000), tmp_path)
     on, off, is_measured = contrast_thresholds(recording, blind_for=8_000_000)
