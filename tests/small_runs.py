@@ -30,6 +30,7 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
     manager.event_pairs = manager.train_num_rays_per_batch = 64
     manager.silent_pairs, manager.silence_ms = 0, 5.0
     model.opacity_loss_weight, model.level_loss_weight, model.distortion_loss_weight = 0.0, 0.0, 0.01
+    model.edge_start = False
     model.log2_table_size, model.num_levels, model.sampling = 12, 4, model.sampling or "proposal"
     model.num_samples = model.num_proposal_samples = 16
     parts = {"data": manager, "model": model, "sensor": model.sensor}

@@ -6,12 +6,20 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from enerf_ns.choices.events import blind_for
 from enerf_ns.choices.extent import depths
 from enerf_ns.choices.scene import Scene, path_extent
+from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.events.statistics import border_rate
 
 SILENT_BORDER = 0.02
 """Share of a sensor's mean events a pixel below which its border is silent, as around an object before nothing."""
+
+MANY_EDGES = 0.05
+"""Share of the pixels with an edge of known depth above which a field starts from edges. Of recordings with fewer,
+pictures lose by such a start (benchmarks/README.md, start from edges)."""
 
 SEEN_AROUND = math.radians(30)
 """Angle (rad) over which the middle of the scene must be seen before gloss is looked for. Over a smaller angle, gloss
@@ -53,6 +61,30 @@ def opacity_loss(scene: Scene) -> None:
         why = f"pixels at the sensor's border fired {share:.2g} times as often as the others: {what}"
     weight = scene.use(name, lambda: 0.0 if before_nothing else 1.0)
     scene.row("opacity loss", bool(weight), f"weight {weight:g}" if weight else "", scene.why(name, why), name)
+
+
+def edge_start(scene: Scene) -> None:
+    """Does the field start from the depth of edges that events show before training?"""
+    name = "model.edge_start"
+    if not scene.use_events or scene.value("model.panorama"):
+        scene.use(name, lambda: False)
+        return
+    kept, why = False, ""
+    if scene.use_frames:
+        why = "frames show surfaces, too"
+    elif scene.once(blind_for):
+        why = "blind pixels miss edges"
+    elif scene.given(name) is None:
+        share = scene.once(edge_share)
+        kept, why = share > MANY_EDGES, f"{100 * share:.1f} % of the pixels see an edge of known depth"
+    kept = scene.use(name, lambda: kept)
+    scene.row("start from edges", kept, "", scene.why(name, why), name)
+
+
+def edge_share(scene: Scene) -> float:
+    """Share of the pixels with an edge of known depth, a mean over views along the trajectory; 0 without a view."""
+    views = edge_depth(scene.recording, scene.once(depths))
+    return float(np.mean([np.count_nonzero(view.depth) / view.depth.size for view in views])) if views else 0.0
 
 
 def view_direction(scene: Scene, probe: Probe | None) -> None:

@@ -45,6 +45,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     extent.hash_grid,
     rays.proposal_network,
     rays.opacity_loss,
+    rays.edge_start,
 )
 """Rows in the order in which they are decided: each may depend on those before it."""
 

@@ -155,6 +155,7 @@ enerf_paper = MethodSpecification(
                 frame_loss_weight=25.0,  # 1 / C^2 at the paper's C = 0.2: its weight of 1, since event losses count C
                 opacity_loss_weight=0.0,
                 distortion_loss_weight=0.0,
+                edge_start=False,
                 eval_num_rays_per_chunk=RAYS_PER_CHUNK,
             ),
             defaults=PAPER,

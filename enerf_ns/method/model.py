@@ -158,9 +158,9 @@ class EnerfModelConfig(ModelConfig):
     this value between a fifth and half of a training of at least 2000 steps, and falls again until four fifths."""
     interlevel_loss_weight: float = 1.0
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
-    edge_start: bool = False
-    """Start from the depth of edges that events show before training. More depth is known then, and in scenes with many
-    edges it is better; pictures may be worse by up to 1 dB (benchmarks/README.md, start from edges)."""
+    edge_start: Optional[bool] = None  # noqa: UP045
+    """Start from the depth of edges that events show before training. Default: True with events alone, where more than
+    5 % of the pixels have such an edge and none is blind after an event; for enerf-paper, False."""
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""

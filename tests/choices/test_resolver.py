@@ -41,7 +41,7 @@ def test_a_field_of_grey_frames_or_events_alone_has_one_channel(recording, colou
 def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
     forced = {
         "max_res": 99, "num_levels": 3, "near_plane": 0.05, "num_channels": 3,
-        "sampling": "uniform", "opacity_loss_weight": 0.3, "view_direction": True,
+        "sampling": "uniform", "opacity_loss_weight": 0.3, "edge_start": True, "view_direction": True,
     }  # fmt: skip
     config = small_config(recording, tmp_path, **{f"model__{name}": value for name, value in forced.items()})
     config.pipeline.model.sensor.contrast_thresholds = (0.1, 0.3)
@@ -59,6 +59,7 @@ def test_what_is_set_is_not_chosen(recording: Path, tmp_path: Path):
         "hash grid",
         "proposal network",
         "opacity loss",
+        "start from edges",
         "view direction",
     )
     assert {why[part] for part in parts} == {"set by flag"}
@@ -287,7 +288,8 @@ def test_what_the_recording_states_of_its_sensor_is_used(recording: Path, tmp_pa
 
 def test_what_a_method_sets_is_said_to_be_set_by_it(recording: Path):
     """Until a flag says otherwise; of enerf nothing is."""
-    parts = ("high dynamic range", "hash grid", "proposal network", "opacity loss", "contraction", "view direction")
+    parts = ("high dynamic range", "hash grid", "proposal network", "opacity loss", "start from edges", "contraction")
+    parts += ("view direction",)
     said = rows(resolve(PAPER, read_recording(recording)))
     assert {said[part].why for part in parts} == {"set by the method"}
     config = copy.deepcopy(PAPER)
@@ -318,6 +320,7 @@ def test_windows_are_as_long_as_is_said(recording: Path, mode: str, window_ms: f
         ("sensor__refractory_period_ns", 1000, "refractory period"),
         ("model__sampling", "uniform", "proposal network"),
         ("model__opacity_loss_weight", 0.0, "opacity loss"),
+        ("model__edge_start", True, "start from edges"),
         ("model__view_direction", True, "view direction"),
         ("data__silent_pairs", 5, "silent pixels"),
         ("model__num_levels", 4, "hash grid"),
@@ -429,6 +432,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "contraction": (True, False),
         "proposal network": ("proposal", "uniform"),
         "opacity loss": (1.0, 0.0),
+        "start from edges": (True, False),
         "view direction": (True, False),
     }
     always_kept = {"response", "box", "hash grid"}
@@ -582,6 +586,45 @@ def test_a_silent_border_is_an_object_before_nothing(recording: Path):
         resolution = resolve(ENERF, replace(whole, stream_events=stream))
         assert resolution.values["model.opacity_loss_weight"] == expected
         assert rows(resolution)["opacity loss"].kept == bool(expected)
+
+
+def of_lines(number: int) -> EventRecording:
+    """A recording of as many lines in space, each of 30 points."""
+    generator = np.random.default_rng(1)
+    depths = np.exp(generator.uniform(0, np.log(3), (number, 1, 1)))
+    across = generator.uniform(-0.6, 0.6, (number, 1, 2))
+    middles = depths * np.concatenate([across, np.ones((number, 1, 1))], axis=2)
+    points = middles + generator.uniform(-0.4, 0.4, (number, 1, 3)) * np.linspace(-1, 1, 30)[:, None]
+    events, trajectory, _ = recording_of_points(points.reshape(-1, 3), shaking(0.2), TURNING)
+    return EventRecording(Path("memory"), "", CAMERA, trajectory, lambda: iter([events]), (), depth_range=(0.7, 4.0))
+
+
+@pytest.mark.slow
+def test_a_field_starts_from_edges_where_there_are_many_and_all_are_seen(recording: Path):
+    many, few = of_lines(80), of_lines(8)
+    blind = copy.deepcopy(ENERF)
+    blind.model.sensor.refractory_period_ns = 1_000_000
+    for config, scene, expected, why in (
+        (ENERF, many, True, "% of the pixels see an edge"),
+        (ENERF, few, False, "% of the pixels see an edge"),
+        (blind, many, False, "blind pixels"),
+        (PAPER, many, False, "set by the method"),
+    ):
+        resolution = resolve(config, scene)
+        row = rows(resolution)["start from edges"]
+        assert resolution.applied_to(config).model.edge_start == row.kept == expected
+        assert why in row.why
+    beside_frames = resolve(frames_config("events+frames"), read_recording(recording))
+    assert not beside_frames.values["model.edge_start"]
+    assert "frames" in rows(beside_frames)["start from edges"].why
+
+
+@pytest.mark.parametrize("config", [frames_config(), None])
+def test_frames_alone_and_a_panorama_show_no_edge_to_start_from(recording: Path, config: Any):
+    config = config or copy.deepcopy(ENERF)
+    config.model.panorama = config.datamanager.supervision == "events"
+    resolution = resolve(config, read_recording(recording))
+    assert resolution.values["model.edge_start"] is False and "start from edges" not in rows(resolution)
 
 
 @pytest.mark.parametrize(("max_res", "levels"), [(16, 1), (32, 3), (64, 5), (256, 9), (4096, 10)])
