@@ -3,9 +3,11 @@
 The trainings of all tables with one seed come first, so that a whole picture is there early; then those with the
 second and the third seed. What is finished is not run again, in the output folder or in the committed result files, as
 long as the code and the settings that it depends on are the same. With --pages, the result files are copied to
-benchmarks/results/, and their tables to the pages. Without it, nothing but the output folder is written.
+benchmarks/results/, and their tables to the pages. With --keep, they are copied to benchmarks/results/next/, from where
+another machine goes on. Without both, nothing but the output folder is written.
 
     python benchmarks/results.py --slider-depth path/to/slider_depth --reconstruction-weights path/to/firenet_1000.pth
+    python benchmarks/results.py --only shake design --keep
     python benchmarks/results.py --only shake design --pages
 """
 
@@ -29,10 +31,14 @@ from enerf_ns.bench.runner import Bench
 from enerf_ns.bench.settings import BenchSettings
 from enerf_ns.bench.tables import markdown, scores_table
 from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.method.origin import code_version
 from enerf_ns.report.tables import Table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+NEXT = RESULTS / "next"
+"""Results of the version that all tables are to be of next, and its figures of views, until all are finished."""
+
 FIGURES = ROOT / "docs" / "figures"
 PAGES = (ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
@@ -124,46 +130,88 @@ def refinement(shown: str, recordings: list[str], faults: list[str], steps: int)
     return OF_REFINEMENT[shown]([json.loads(line) for line in trained], recordings, faults, steps)
 
 
-def views(bench: Bench) -> Image.Image:
-    """One held-out frame of each sequence beside the renders of all rows, of the first seed.
-
-    A run leaves a picture of both (`VIEW`), so that a row without runs on this machine has no picture.
-    """
-    header, gap, label = 14, 2, LABEL_WIDTH
-    sequences: dict[str, dict[str, Image.Image]] = {}
+def pictures(bench: Bench) -> dict[str, dict[str, Path]]:
+    """By sequence and row, the picture (`VIEW`) of a held-out frame beside its render that the run of the first seed
+    left on this machine."""
+    found: dict[str, dict[str, Path]] = {}
     for cell in bench.cells:
         file = bench.folder(cell) / VIEW / "eval_img_0000.png"
         if cell.seed == 0 and file.exists():
+            found.setdefault(cell.sequence, {})[cell.row] = file
+    return found
+
+
+def views(bench: Bench) -> Image.Image:
+    """One held-out frame of each sequence beside the renders of all rows whose `pictures` are there."""
+    header, gap, label = 14, 2, LABEL_WIDTH
+    sequences: dict[str, dict[str, Image.Image]] = {}
+    for sequence, files in pictures(bench).items():
+        for row, file in files.items():
             with Image.open(file) as both:
                 half = both.width // 2
                 frame, render = (both.crop((start, 0, start + half, both.height)) for start in (0, half))
-            sequences.setdefault(cell.sequence, {"frame": frame})[cell.row] = render
-    columns = list(dict.fromkeys(name for pictures in sequences.values() for name in pictures))
+            sequences.setdefault(sequence, {"frame": frame})[row] = render
+    columns = list(dict.fromkeys(name for shown in sequences.values() for name in shown))
     width = (FIGURE_WIDTH - label) // max(1, len(columns)) - gap
-    heights = [round(pictures["frame"].height * width / pictures["frame"].width) for pictures in sequences.values()]
+    heights = [round(shown["frame"].height * width / shown["frame"].width) for shown in sequences.values()]
     size = (label + len(columns) * (width + gap), header + sum(heights) + gap * len(heights))
     figure = Image.new("RGB", size, "white")
     draw, top = ImageDraw.Draw(figure), header
     for number, name in enumerate(columns):
         draw.text((label + number * (width + gap), 1), name, fill="black")
-    for (sequence, pictures), height in zip(sequences.items(), heights, strict=True):
+    for (sequence, shown), height in zip(sequences.items(), heights, strict=True):
         draw.text((1, top + height // 2), sequence, fill="black")
         for number, name in enumerate(columns):
-            if name in pictures:
-                figure.paste(pictures[name].resize((width, height)), (label + number * (width + gap), top))
+            if name in shown:
+                figure.paste(shown[name].resize((width, height)), (label + number * (width + gap), top))
         top += height + gap
     return figure
 
 
-def write_figures(name: str, bench: Bench) -> None:
-    """Writes docs/figures/results-NAME.png, error against time, and results-NAME-views.png, if a page shows them."""
-    shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    if f"results-{name}.png" in shown:
+def shown_figure(name: str, kind: str = "") -> str | None:
+    """File name of the figure of an experiment; None if no page shows it."""
+    file = f"results-{name}{kind}.png"
+    return file if any(file in page.read_text(encoding="utf-8") for page in PAGES) else None
+
+
+def write_views(name: str, bench: Bench, folder: Path) -> None:
+    """Writes results-NAME-views.png, if a page shows it and the runs of all rows are on this machine."""
+    file = shown_figure(name, "-views")
+    there = sum(map(len, pictures(bench).values()))
+    if file and there == sum(cell.seed == 0 for cell in bench.cells):
+        views(bench).quantize(256).save(folder / file, optimize=True)
+    elif file:
+        print(f"{file} is not written: not all of its runs are on this machine", flush=True)
+
+
+def merged(*files: Path) -> dict[str, Any]:
+    """The contents of the last of some result files that are there, with the trainings of all."""
+    found = [json.loads(file.read_text()) for file in files if file.exists()]
+    runs = {run["inputs"]: run for results in found for run in results["runs"]}
+    return {**found[-1], "runs": list(runs.values())}
+
+
+def keep(name: str, bench: Bench) -> None:
+    """Keeps the results of an experiment in `NEXT`, from where another machine goes on."""
+    NEXT.mkdir(parents=True, exist_ok=True)
+    results = merged(NEXT / f"{name}.json", bench.output_dir / f"{name}.json")
+    runs = [run for run in results["runs"] if run["version"] == code_version()]
+    write_whole(NEXT / f"{name}.json", json.dumps({**results, "runs": runs}, indent=1) + "\n")
+    write_views(name, bench, NEXT)
+
+
+def publish(name: str, bench: Bench) -> None:
+    """Puts the results of an experiment and its figures where the pages take them from."""
+    shutil.copy(bench.output_dir / f"{name}.json", RESULTS)
+    (NEXT / f"{name}.json").unlink(missing_ok=True)
+    if file := shown_figure(name):
         picture = diagram(json.loads((RESULTS / f"{name}.json").read_text()))
         assert picture is not None
-        (FIGURES / f"results-{name}.png").write_bytes(picture)
-    if f"results-{name}-views.png" in shown:
-        views(bench).quantize(256).save(FIGURES / f"results-{name}-views.png", optimize=True)
+        (FIGURES / file).write_bytes(picture)
+    kept = NEXT / f"results-{name}-views.png"
+    if kept.exists():
+        shutil.move(kept, FIGURES / kept.name)
+    write_views(name, bench, FIGURES)
 
 
 def written(page: str) -> str:
@@ -191,12 +239,13 @@ def main() -> None:
     parser.add_argument("--slider-depth", type=Path, help="recording slider_depth of UZH's data set")
     parser.add_argument("--reconstruction-weights", type=Path, help="weights of E2VID or FireNet")
     parser.add_argument("--output-dir", type=Path, default=ROOT / "outputs" / "results")
+    parser.add_argument("--keep", action="store_true", help="keep what is finished for a run on another machine")
     parser.add_argument("--pages", action="store_true", help="copy the results of all seeds to the pages")
     arguments = parser.parse_args()
     arguments.output_dir.mkdir(parents=True, exist_ok=True)
-    for file in RESULTS.glob("*.json"):
-        if not (arguments.output_dir / file.name).exists():
-            shutil.copy(file, arguments.output_dir)
+    for name in {file.name for folder in (RESULTS, NEXT) for file in folder.glob("*.json")}:
+        results = merged(*(folder / name for folder in (RESULTS, NEXT, arguments.output_dir)))
+        write_whole(arguments.output_dir / name, json.dumps(results))
     passes = [benches(arguments, seeds) for seeds in range(1, SEEDS + 1)]  # all, before any writes a result file
     for seeds, experiments in enumerate(passes, 1):
         for name, bench in experiments.items():
@@ -208,10 +257,11 @@ def main() -> None:
                 elif "failure" in result:
                     print(f"{training} failed: {result['failure']}", flush=True)
             print(f"{name}, seeds: {seeds}, after {time.monotonic() - begin:.0f} s", flush=True)
+            if arguments.keep:
+                keep(name, bench)
     if arguments.pages:
         for name, bench in passes[-1].items():
-            shutil.copy(arguments.output_dir / f"{name}.json", RESULTS)
-            write_figures(name, bench)
+            publish(name, bench)
         for page in PAGES:
             write_whole(page, written(page.read_text(encoding="utf-8")))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from argparse import Namespace
 from pathlib import Path
@@ -62,6 +63,41 @@ def test_the_figure_of_views_has_the_frame_and_the_render_of_each_row(finished: 
     np.testing.assert_array_equal(figure[top : top + shown.height, left : left + width], np.asarray(shown))
     recorded = sorted((finished / "recordings").glob("*/images/*.png"))
     assert any(np.array_equal(np.asarray(Image.open(file).convert("RGB")), np.asarray(frame)) for file in recorded)
+
+
+def test_what_is_kept_is_trained_on_no_other_machine_and_is_published(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """One machine finishes a part of an experiment, another the rest, and the pages show all."""
+    folders = {name: tmp_path / name.lower() for name in ("RESULTS", "FIGURES")}
+    for name, folder in folders.items():
+        folder.mkdir()
+        monkeypatch.setattr(results, name, folder)
+    monkeypatch.setattr(results, "NEXT", folders["RESULTS"] / "next")
+    (tmp_path / "page.md").write_text("results-design-views.png")
+    monkeypatch.setattr(results, "PAGES", [tmp_path / "page.md"])
+    monkeypatch.setattr(results, "PLAN", {"design": {**SMALL_BENCH, "seeds": 1}})
+    first, second = tmp_path / "first", tmp_path / "second"
+    shutil.copytree(finished, first)
+    rows = {"part": ("events",), "all": SMALL_BENCH["rows"]}
+    for part, output_dir, flags in (("part", first, ["--keep"]), ("all", second, ["--keep"]), ("all", second, [])):
+        results.PLAN["design"]["rows"] = rows[part]
+        monkeypatch.setattr(sys, "argv", ["results.py", "--only", "design", "--output-dir", str(output_dir), *flags])
+        results.main()
+        kept = json.loads((results.NEXT / "design.json").read_text())["runs"]
+        assert {run["row"] for run in kept} == set(rows[part])
+        figure = results.NEXT / "results-design-views.png"
+        assert figure.exists() == (part == "part")  # the second machine has not all renders
+        figure.unlink(missing_ok=True)
+    trained = {folder.name.partition("-seed-")[0] for folder in (second / "runs").glob("*/*/*")}
+    assert trained == {"uniform-samples"}
+    figure.write_bytes(b"kept")
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--pages"])
+    results.main()
+    published = json.loads((results.RESULTS / "design.json").read_text())["runs"]
+    assert sorted(run["inputs"] for run in published) == sorted(run["inputs"] for run in kept)
+    assert (results.FIGURES / "results-design-views.png").read_bytes() == b"kept"
+    assert not list(results.NEXT.iterdir())
 
 
 def test_a_table_by_hand_is_written_over_and_the_text_around_it_stays():
