@@ -1,7 +1,8 @@
 """Flags on the command line: their help in groups, and a sentence about a flag that does not exist.
 
 `ns-train` belongs to Nerfstudio, and tyro prints its help and its errors. `speak_for_methods` replaces both for the
-methods of this package, and leaves them as they are for all others and for a tyro that has them elsewhere.
+methods of this package, and leaves them as they are for all others and for a tyro that has them elsewhere. The help of
+`enerf` is tyro's own, with `join_lines_of_help`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
-from functools import wraps
+from functools import cache, wraps
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -125,6 +126,26 @@ def speak_for_methods(config: type, names: Sequence[str]) -> None:
         refuse(*args, **options)
 
     tyros.format_help, tyros.unrecognized_args_error = help_lines, refused
+
+
+@cache
+def join_lines_of_help() -> None:
+    """Makes tyro join the lines of the docstring of a flag, so that help is as wide as the terminal.
+
+    tyro 1.0.17 joins lines that begin with a letter, before it takes away the indent of the lines after the first.
+    """
+    try:
+        from tyro import _docstrings as tyros
+
+        read = tyros.parse_docstring_from_object
+    except (ImportError, AttributeError):
+        return
+
+    @wraps(read)
+    def joined(of: object) -> dict[str, str]:
+        return {name: " ".join(text.split()) for name, text in read(of).items()}
+
+    tyros.parse_docstring_from_object = joined
 
 
 def _tried(make: Callable[[], Any]) -> Any:

@@ -156,6 +156,7 @@ SEAMS = (
             *("console_outputs", "add_help"),
         ),
     ),
+    Seam("tyro._docstrings:parse_docstring_from_object", "flags joins the lines of help", ("obj",)),
     Seam("tyro._arguments:generate_argument_helptext", "flags shows the text of a flag", ("arg", "lowered", "compact")),
 )
 """All seams, those of this module and those of others."""

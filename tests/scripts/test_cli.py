@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,18 @@ def test_every_command_has_a_help(command: str, monkeypatch, capsys: pytest.Capt
         cli.entrypoint()
     assert end.value.code == 0
     assert f"usage: enerf {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_breaks_lines_by_the_width_of_the_terminal_alone(command: str, monkeypatch, capsys):
+    """On a terminal that is wide enough, the text of each flag is one line, beside the flag or below it."""
+    monkeypatch.setattr(sys, "argv", ["enerf", command, "--help"])
+    monkeypatch.setenv("COLUMNS", "2000")
+    with pytest.raises(SystemExit):
+        cli.entrypoint()
+    lines = [line.strip("│|").rstrip() for line in capsys.readouterr().out.splitlines()]
+    continued = [bool(re.match(r" {10,}", line)) for line in lines]
+    assert len(lines) > 5 and not [lines[n] for n in range(1, len(lines)) if continued[n - 1] and continued[n]]
 
 
 @pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"]])
