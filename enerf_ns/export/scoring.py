@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,6 +13,7 @@ from scipy.spatial import KDTree
 
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.files import read_json
+from enerf_ns.export.open3d_library import open3d
 from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import Scene
@@ -113,10 +113,9 @@ def distances(
     """Distance of each point to a mesh, or to the nearest point of a cloud."""
     if isinstance(surface, trimesh.PointCloud):
         return KDTree(surface.vertices).query(points)[0]
-    import open3d
-
-    tensor: Any = open3d.core.Tensor
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    library = open3d()
+    tensor = library.core.Tensor
+    scene = library.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(
         tensor(np.asarray(surface.vertices, np.float32)),
         tensor(np.asarray(surface.faces, np.uint32)),

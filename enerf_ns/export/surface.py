@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from rich.progress import track
 
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.export.open3d_library import open3d
 from enerf_ns.method.pipeline import EnerfPipeline
 from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.rendering.spread_depth import depth_evidence
@@ -130,10 +130,8 @@ def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh
     Returns:
         Vertices in metres, with colours; empty where no depth is known.
     """
-    import open3d
-
-    core: Any = open3d.core
-    image, block_grid = open3d.t.geometry.Image, cast("Any", open3d.t.geometry.VoxelBlockGrid)
+    library = open3d()
+    core, image, block_grid = library.core, library.t.geometry.Image, library.t.geometry.VoxelBlockGrid
     names, types, channels = ("tsdf", "weight", "color"), (core.float32,) * 3, (1, 1, 3)
     grid = block_grid(names, types, channels, voxel, BLOCK, NUM_BLOCKS)  # of the older volumes, one stays empty
     intrinsics = core.Tensor(camera.matrix)

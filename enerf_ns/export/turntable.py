@@ -10,6 +10,7 @@ from jaxtyping import Float64, UInt8
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.export.open3d_library import open3d
 
 NUM_PICTURES = 24
 """Pictures of one swing."""
@@ -39,10 +40,9 @@ def turntable(
             and is moved so that the middle of the mesh is in the middle of the picture.
         number: Number of pictures.
     """
-    import open3d
-
-    tensor: Any = open3d.core.Tensor
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    library = open3d()
+    tensor = library.core.Tensor
+    scene = library.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(tensor(np.asarray(mesh.vertices, np.float32)), tensor(np.asarray(mesh.faces, np.uint32)))
     visual: Any = mesh.visual
     colours = np.asarray(visual.vertex_colors, np.float32)[:, :3][mesh.faces]

@@ -14,7 +14,7 @@ import numpy as np
 
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.index.indexing import index_events
-from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, quoted
+from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, UserError, quoted
 from enerf_ns.dataparsers.recording.files import write_together, write_whole
 from enerf_ns.evaluation.display import shown_numbers
 from enerf_ns.evaluation.scores import summary_scores
@@ -248,7 +248,7 @@ def _turning_mesh(one: Reported, pipeline: EnerfPipeline) -> bytes | None:
         if len(mesh.faces):
             return animated(turntable(mesh, camera, views[len(views) // 2].pose))
         one.notes.append("The mesh has no surface, so it is left out; train longer.")
-    except (RecordingError, ImportError) as error:
+    except UserError as error:
         one.notes.append(f"The mesh is left out: {str(error).rstrip('.')}.")
     return None
 

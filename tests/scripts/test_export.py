@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -60,6 +63,22 @@ def test_a_reference_takes_the_place_of_the_simulated_scene(run: Path, tmp_path:
     Export("mesh", run, tmp_path / "mesh.ply", voxel=0.1, reference=tmp_path / "room.ply").main()
     scores = json.loads((tmp_path / "mesh.json").read_text())
     assert 5.0 < scores["accuracy"] < 10.0 and scores["complete_share"] == 0.0
+
+
+def test_a_machine_without_the_libraries_of_open3d_is_told_to_install_them(run: Path, tmp_path: Path):
+    """As a slim container is, on which `import open3d` raises this error."""
+    (tmp_path / "open3d.py").write_text('raise ImportError("libusb-1.0.so.0: cannot open shared object file")\n')
+    output = tmp_path / "new" / "mesh.ply"
+    script = (
+        "import sys\nfrom enerf_ns.export import surface\nfrom enerf_ns.scripts.cli import entrypoint\n"
+        f"surface.SURE = 0.0\nsys.argv = ['enerf', 'export', 'mesh', {str(run)!r}, '--output', {str(output)!r}]\n"
+        "entrypoint()"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and not output.parent.exists()
+    assert "libusb-1.0.so.0" in ended.stderr and "apt-get install libusb-1.0-0" in ended.stderr
 
 
 def test_mistakes_are_sentences_and_leave_nothing(run: Path, recording: Path, tmp_path: Path):
