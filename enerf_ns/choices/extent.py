@@ -87,7 +87,7 @@ def contraction(scene: Scene) -> None:
         scene.use(name, lambda: False)
         return
     is_set = scene.value(f"{DATAPARSER}.box") is not None
-    share = 0.0 if is_set else share_beyond(scene.recording, near_far)
+    share = 0.0 if is_set else share_beyond(scene.once(corrected_recording), near_far)
     kept = scene.use(name, lambda: share > SHARE_BEYOND)
     why = "the box is set" if is_set else f"{100 * share:.1f} % of the events come from beyond {near_far[1]:.3g} m"
     scene.row("contraction", kept, "space beyond the box" * kept, scene.why(name, why), name)

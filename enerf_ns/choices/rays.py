@@ -10,6 +10,7 @@ import numpy as np
 
 from enerf_ns.choices.events import blind_for
 from enerf_ns.choices.extent import depths
+from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import Scene, path_extent
 from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.events.statistics import border_rate
@@ -83,7 +84,7 @@ def edge_start(scene: Scene) -> None:
 
 def edge_share(scene: Scene) -> float:
     """Share of the pixels with an edge of known depth, a mean over views along the trajectory; 0 without a view."""
-    views = edge_depth(scene.recording, scene.once(depths))
+    views = edge_depth(scene.once(corrected_recording), scene.once(depths))
     return float(np.mean([np.count_nonzero(view.depth) / view.depth.size for view in views])) if views else 0.0
 
 

@@ -574,6 +574,19 @@ def test_events_from_beyond_the_box_decide_on_contraction():
         assert "come from beyond" in row.why
 
 
+def test_a_clock_that_is_corrected_moves_no_event_beyond_the_box():
+    generator = np.random.default_rng(4)
+    depths = np.exp(generator.uniform(0.0, np.log(2.0), (400, 1)))
+    points = depths * np.append(generator.uniform(-0.6, 0.6, (400, 2)), np.ones((400, 1)), axis=1)
+    events, given, _ = recording_of_points(points, shaking(0.1), TURNING)
+    late = Trajectory(given.times + 20_000_000, given.positions, given.quaternions)
+    made = EventRecording(Path("memory"), "", CAMERA, late, lambda: iter([events]), (), depth_range=(0.9, 2.2))
+    for clock, kept in ((0.0, True), (20.0, False)):
+        config = copy.deepcopy(ENERF)
+        config.poses.clock_ms = clock
+        assert rows(resolve(config, made))["contraction"].kept == kept
+
+
 def test_a_silent_border_is_an_object_before_nothing(recording: Path):
     whole = read_recording(recording)
 
@@ -617,6 +630,20 @@ def test_a_field_starts_from_edges_where_there_are_many_and_all_are_seen(recordi
     beside_frames = resolve(frames_config("events+frames"), read_recording(recording))
     assert not beside_frames.values["model.edge_start"]
     assert "frames" in rows(beside_frames)["start from edges"].why
+
+
+@pytest.mark.slow
+def test_edges_are_looked_for_at_the_right_time_of_a_clock_that_is_wrong():
+    right = of_lines(80)
+    given = right.trajectory
+    late = Trajectory(given.times + 30_000_000, given.positions, given.quaternions)
+    said = {}
+    for clock, trajectory in ((0.0, given), (0.0, late), (30.0, late)):
+        config = copy.deepcopy(ENERF)
+        config.poses.clock_ms = clock
+        row = rows(resolve(config, replace(right, trajectory=trajectory)))["start from edges"]
+        said[clock, trajectory is late] = float(row.why.partition(" %")[0])
+    assert said[0.0, False] == pytest.approx(said[30.0, True], rel=0.05) and said[0.0, True] < 0.5 * said[0.0, False]
 
 
 @pytest.mark.parametrize("config", [frames_config(), None])
