@@ -211,7 +211,8 @@ def publish(name: str, bench: Bench) -> None:
     kept = NEXT / f"results-{name}-views.png"
     if kept.exists():
         shutil.move(kept, FIGURES / kept.name)
-    write_views(name, bench, FIGURES)
+    else:
+        write_views(name, bench, FIGURES)
 
 
 def written(page: str) -> str:

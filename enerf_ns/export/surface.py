@@ -129,6 +129,9 @@ def fused(camera: Camera, views: Sequence[SurfaceView], voxel: float) -> trimesh
 
     Returns:
         Vertices in metres, with colours; empty where no depth is known.
+
+    Raises:
+        UserError: Open3D cannot be loaded.
     """
     library = open3d()
     core, image, block_grid = library.core, library.t.geometry.Image, library.t.geometry.VoxelBlockGrid

@@ -39,6 +39,9 @@ def turntable(
         pose: Pose in the middle of the swing, camera to world in OpenCV axes, metres. The camera keeps its direction,
             and is moved so that the middle of the mesh is in the middle of the picture.
         number: Number of pictures.
+
+    Raises:
+        UserError: Open3D cannot be loaded.
     """
     library = open3d()
     tensor = library.core.Tensor
