@@ -17,14 +17,13 @@ from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.export.open3d_library import open3d
 from enerf_ns.method.pipeline import EnerfPipeline
 from enerf_ns.poses.posed_camera import PosedCamera
-from enerf_ns.rendering.spread_depth import depth_evidence
 
 NUM_VIEWS = 40
 """Number of views that are fused, spread evenly over the trajectory."""
 
-SURE = 0.3
-"""Confidence from which depth is fused. It is lower than for scores, because views are averaged. Between 0.5 and 0.05,
-a lower value makes the surface more complete and less accurate. The Chamfer distance is least at 0.15 to 0.3."""
+SURE = 0.15
+"""Confidence from which depth is fused. It is lower than for scores, because views are averaged. A lower value makes
+the surface more complete and less accurate. The Chamfer distance is least at 0.15 to 0.3."""
 
 VOXEL_PIXELS = 1.5
 """Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
@@ -55,7 +54,7 @@ class SurfaceView:
     pose: Float64[np.ndarray, "3 4"]
     """Camera to world, OpenCV axes, metres."""
     depth: Float32[np.ndarray, "height width"]
-    """Spread depth along the optical axis, metres."""
+    """Rendered depth along the optical axis, metres."""
     known: Bool[np.ndarray, "height width"]
     """Whether the confidence of the depth is at least `SURE`."""
     brightness: Float32[np.ndarray, "height width 3"]
@@ -88,12 +87,10 @@ def surface_views(pipeline: EnerfPipeline, number: int = NUM_VIEWS) -> tuple[Cam
         times = torch.full_like(pixels, int(time))
         rays = posed.rays(pixels, times).reshape((camera.height, camera.width))
         shown = model.get_outputs_for_camera_ray_bundle(rays)
-        brightness = shown["rgb"].cpu()
-        depth = (shown["depth"] / rays.metadata["directions_norm"]).cpu() / scale
-        confidence, spread = depth_evidence(model, rays, depth, brightness, scale)
+        depth = (shown["depth"] / rays.metadata["directions_norm"])[..., 0].cpu() / scale
+        known = (shown["confidence"][..., 0].cpu() >= SURE) & (depth > 0.0) & depth.isfinite()
         pose = recording.trajectory.poses(torch.as_tensor(int(time))).numpy()
-        known = (confidence >= SURE) & (spread > 0.0) & spread.isfinite()
-        views.append(SurfaceView(pose, spread[..., 0].numpy(), known[..., 0].numpy(), brightness.numpy()))
+        views.append(SurfaceView(pose, depth.numpy(), known.numpy(), shown["rgb"].cpu().numpy()))
     return camera, views
 
 

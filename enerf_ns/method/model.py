@@ -40,7 +40,7 @@ from enerf_ns.rendering.ray_samplers import (
     PairedUniformSampler,
     paired_rand,
 )
-from enerf_ns.rendering.seen_volume import SeenVolume
+from enerf_ns.rendering.seen_volume import SeenVolume, is_rim
 from enerf_ns.sensor.sensor_model import SensorModelConfig
 from enerf_ns.supervision.balance import ErrorBalance
 from enerf_ns.supervision.event_supervision import EventSupervision, brightness_change
@@ -399,7 +399,7 @@ class EnerfModel(Model):
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Outputs:
         """Outputs of the rays of a picture, each of shape (height, width, channels). Normals and confidence are
-        computed when they are read."""
+        computed when they are read. Confidence is 0 at rims (`is_rim`)."""
         outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
 
         def normals() -> Tensor:
@@ -409,7 +409,8 @@ class EnerfModel(Model):
             return torch.cat(found).view(points.shape)
 
         outputs["normals"] = normals
-        outputs["confidence"] = lambda: self.depth_evidence(camera_ray_bundle, outputs["depth"])[0]
+        depth = outputs["depth"]
+        outputs["confidence"] = lambda: self.depth_evidence(camera_ray_bundle, depth)[0] * ~is_rim(depth)
         return outputs
 
     @torch.no_grad()

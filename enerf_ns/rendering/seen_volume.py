@@ -23,16 +23,21 @@ voxel of a face of a cubic box."""
 NUM_EVENTS = 20_000
 """Largest number of events that find the places that events come from."""
 
-FEW_EVENTS = 0.1
-"""Number of events, relative to `SeenVolume.mean_events`, at which `SeenVolume.evidence` is 0.5. A field that
-contracts fog is thin at untextured surfaces, too: only events tell where its depth is right."""
+FEW_EVENTS = 0.08
+"""Number of events at which `SeenVolume.evidence` is 0.5, relative to their mean number. A field that contracts fog is
+thin at untextured surfaces, too: only events tell where its depth is right."""
+
+FEWEST_SAMPLED = 10
+"""Least number of sampled events at which the evidence is 0.5. Some events come from outlines whose place is not exact,
+and lie where no surface is."""
 
 OUTLINE = 2
 """Distance in pixels up to which the ray of an event passes the outline of an object. There, events come from the
 object, and not from what it hides."""
 
 STEP = 0.1
-"""Share of the depth by which an outline stands before what it hides; smaller steps are those of curved surfaces."""
+"""Least share of the depth by which an outline stands before what it hides; smaller steps are those of curved
+surfaces."""
 
 STEPS_A_VOXEL = 2
 """Number of points on a ray, for each length of a voxel's side, whose voxels count as passed."""
@@ -54,8 +59,9 @@ class SeenVolume:
     num_events: Float[Tensor, "x y z"]
     """Number of events of the whole recording that came from the voxel or one of its 26 neighbours. An event came from
     the end of its ray, or from as near as a surface `OUTLINE` pixels beside it."""
-    mean_events: float
-    """Mean of `num_events` over the surfaces that the camera sees, with equal weight for each pixel."""
+    few_events: float
+    """The value of `num_events` at which the evidence is 0.5: `FEW_EVENTS` times the mean of `num_events` over the
+    surfaces that the camera sees, with equal weight for each pixel, but at least `FEWEST_SAMPLED` sampled events."""
 
     @classmethod
     @torch.no_grad()
@@ -106,7 +112,8 @@ class SeenVolume:
         )
         volume = cls(aabb, is_seen, sum_of_neighbours(points_per_voxel(aabb, shape, came_from)) / share, 0.0)
         seen_at = looks.origins + looks.directions * depths[:NUM_RAYS]
-        return replace(volume, mean_events=float(volume.events(seen_at).mean()))
+        few = FEW_EVENTS * float(volume.events(seen_at).mean())
+        return replace(volume, few_events=max(few, FEWEST_SAMPLED / share))
 
     def seen(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
         """Returns whether points, in scene units, lie in voxels that were seen."""
@@ -121,10 +128,10 @@ class SeenVolume:
     def evidence(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Returns the evidence of events at points, in scene units: from 0 without events to 1 with very many.
 
-        It is n / (n + few) for n `events`, where few is `FEW_EVENTS` times `mean_events`.
+        It is n / (n + few) for n `events`, where few is `few_events`.
         """
         events = self.events(points)
-        return events / (events + max(FEW_EVENTS * self.mean_events, 1e-6))
+        return events / (events + self.few_events)
 
 
 def before_outlines(depths: Float[Tensor, "5 events 1"]) -> Float[Tensor, "events 1"]:
@@ -141,6 +148,23 @@ def before_outlines(depths: Float[Tensor, "5 events 1"]) -> Float[Tensor, "event
     own, right, left, below, above = inverse
     bends = torch.maximum(right + left, below + above) - 2.0 * own
     return torch.where(bends > STEP * own, 1.0 / inverse.amax(0), depths[0])
+
+
+def is_rim(depth: Float[Tensor, "height width 1"]) -> Bool[Tensor, "height width 1"]:
+    """Returns which pixels of a picture are the outermost of a surface that hides another.
+
+    A surface is rendered up to a pixel too wide, since density falls off within a cell of the hash grid, so that the
+    true depth of a rim may be that of what lies behind.
+
+    Args:
+        depth: Depth of pixels. 0 is that of a ray that meets nothing.
+    """
+    inverse = torch.where(depth > 0.0, 1.0 / depth, 0.0)[..., 0]
+    padded = torch.nn.functional.pad(inverse[None, None], (1,) * 4, mode="replicate")[0, 0]
+    right, left = padded[1:-1, 2:], padded[1:-1, :-2]
+    below, above = padded[2:, 1:-1], padded[:-2, 1:-1]
+    bends = torch.minimum(right + left, below + above) - 2.0 * inverse
+    return (bends < -STEP * inverse)[..., None]
 
 
 def grid_shape(aabb: Float[Tensor, "2 3"]) -> torch.Size:

@@ -12,6 +12,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from enerf_ns.rendering.field import DARKEST
+from enerf_ns.rendering.seen_volume import is_rim
 
 EDGE_OF_BRIGHTNESS = 0.1
 """Difference of log brightness between neighbours that weakens spreading by a factor of e."""
@@ -57,11 +58,12 @@ def depth_evidence(
         scale: Scene units per metre.
 
     Returns:
-        Confidence from 0 to 1 (`EnerfModel.depth_evidence`), and `spread_depth` along the optical axis, in metres.
+        Confidence from 0 to 1 (`EnerfModel.depth_evidence`), which is 0 at rims (`is_rim`), and `spread_depth` along
+        the optical axis, in metres, to which rims contribute.
     """
     along = scale * rays.metadata["directions_norm"].to(depth.device)
     confidence, far = model.depth_evidence(rays, depth * along)
-    return confidence, spread_depth(depth, far / along, confidence, brightness)
+    return confidence * ~is_rim(depth), spread_depth(depth, far / along, confidence, brightness)
 
 
 def spread_depth(

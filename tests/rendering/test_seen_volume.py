@@ -14,13 +14,17 @@ from nerfstudio.model_components.scene_colliders import NearFarCollider
 from small_runs import set_up, small_config
 
 from enerf_ns.method.model import BoxCollider
+from enerf_ns.rendering import seen_volume
 from enerf_ns.rendering.seen_volume import (
     FEW_EVENTS,
+    NUM_EVENTS,
     OUTLINE,
+    STEP,
     STEPS_A_VOXEL,
     SeenVolume,
     before_outlines,
     grid_shape,
+    is_rim,
     points_per_voxel,
     sum_of_neighbours,
     voxel_indices,
@@ -144,12 +148,30 @@ def test_voxels_are_about_cubes_and_what_is_no_number_lies_in_none():
 
 def test_evidence_is_half_at_few_events_and_grows_with_their_number():
     aabb = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    numbers = torch.tensor([0.0, FEW_EVENTS * 50.0, 50.0, 5000.0])
-    volume = SeenVolume(aabb, torch.ones(4, 1, 1, dtype=torch.bool), numbers.reshape(4, 1, 1), 50.0)
+    numbers = torch.tensor([0.0, 4.0, 50.0, 5000.0])
+    volume = SeenVolume(aabb, torch.ones(4, 1, 1, dtype=torch.bool), numbers.reshape(4, 1, 1), 4.0)
     centres = torch.tensor([[0.125 + 0.25 * voxel, 0.5, 0.5] for voxel in range(4)])
     evidence = volume.evidence(centres).tolist()
     assert evidence[:2] == pytest.approx([0.0, 0.5])
-    assert evidence[2] == pytest.approx(1.0 / (1.0 + FEW_EVENTS)) and evidence[2] < evidence[3] < 1.0
+    assert evidence[2] == pytest.approx(50.0 / 54.0) and evidence[2] < evidence[3] < 1.0
+
+
+@pytest.mark.parametrize("fewest", [0.1, 10])
+def test_few_events_are_a_share_of_the_mean_but_no_fewer_than_some_samples(
+    pipeline: Any, monkeypatch: pytest.MonkeyPatch, fewest: float
+):
+    monkeypatch.setattr(seen_volume, "FEWEST_SAMPLED", fewest)
+    box, manager = pipeline.model.scene_box, pipeline.datamanager
+    model: Any = WallModel(box.aabb, BoxCollider(box, pipeline.model.config.near_plane))
+    volume = SeenVolume.of(model, manager.recording, manager.index, manager.event_camera)
+    camera, instants = manager.event_camera, torch.from_numpy(manager.recording.instants(40))
+    pixels = torch.arange(0, camera.camera.width * camera.camera.height, 7)
+    rays = camera.rays(pixels.repeat(len(instants)), instants.repeat_interleave(len(pixels)))
+    walls = rays.origins + rays.directions * ((WALL - rays.origins[:, 1:2]) / rays.directions[:, 1:2])
+    share = len(manager.index.events(at_most=NUM_EVENTS)) / len(manager.index)
+    of_mean, of_samples = FEW_EVENTS * float(volume.events(walls).mean()), fewest / share
+    assert (of_mean < of_samples) == (fewest == 10)  # the case that is to be shown
+    assert volume.few_events == pytest.approx(max(of_mean, of_samples), rel=0.1)
 
 
 def _around(depth_at: Any, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -195,3 +217,33 @@ def test_events_of_a_slanted_plane_and_of_a_ball_come_from_their_rays():
         torch.testing.assert_close(
             before_outlines(_around(depth_at, x, y))[chosen][:, 0], depth_at(x, y)[chosen], rtol=0.0, atol=0.0
         )
+
+
+def test_the_rim_is_the_outermost_pixel_of_a_surface_that_hides_another():
+    """Against a loop that compares each pixel with both pairs of neighbours."""
+    rows, columns = np.mgrid[:40, :60]
+    floor = 70.0 / (rows + 30.0)  # a plane, whose inverse depth is linear
+    ball = np.where((rows - 18) ** 2 + (columns - 30) ** 2 <= 100, 0.8 * floor.min(), floor)
+    depth = torch.from_numpy(ball)[..., None]
+    found = is_rim(depth)[..., 0].numpy()
+    expected = np.zeros_like(found)
+    inverse = np.pad(1.0 / ball, 1, mode="edge")
+    for row, column in np.ndindex(*ball.shape):
+        own = inverse[row + 1, column + 1]
+        pairs = (inverse[row + 1, [column, column + 2]], inverse[[row, row + 2], column + 1])
+        expected[row, column] = any(sum(pair) - 2.0 * own < -STEP * own for pair in pairs)
+    np.testing.assert_array_equal(found, expected)
+    inside = ball < floor
+    assert found.any() and not found[~inside].any()
+    core = np.logical_and.reduce([np.roll(inside, step, axis) for step in (-1, 1) for axis in (0, 1)])
+    assert not found[core].any() and found[inside & ~core].mean() > 0.9
+
+
+def test_nothing_is_the_rim_of_a_plane_or_of_what_meets_nothing():
+    plane = torch.from_numpy(1.0 / (0.2 + 0.01 * np.arange(30.0)[:, None] + 0.002 * np.arange(40.0)))[..., None]
+    assert not is_rim(plane).any() and not is_rim(torch.zeros(5, 5, 1)).any()
+    assert not is_rim(torch.full((1, 1, 1), 2.0)).any()
+    before_nothing = torch.zeros(5, 5, 1)
+    before_nothing[2, 2] = 1.0
+    assert is_rim(before_nothing).nonzero().tolist() == [[2, 2, 0]]
+    assert not is_rim(torch.full((3, 3, 1), torch.nan)).any()

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.models.base_model import Model
 from small_runs import set_up, small_config
 
 from enerf_ns.method.model import AROUND_DEPTH, FAR_SHARE
@@ -112,6 +113,22 @@ def test_the_evidence_of_a_picture_is_of_metres_along_the_optical_axis(pipeline:
     torch.testing.assert_close(asked[0], 0.8 * rays.metadata["directions_norm"])
     torch.testing.assert_close(spread, torch.full_like(wall, 3.0), rtol=1e-3, atol=0)
     assert not confidence.any()
+
+
+def test_there_is_no_confidence_at_rims_whose_depth_is_spread(pipeline: Any, monkeypatch: pytest.MonkeyPatch):
+    """In the evidence of a picture, and in the outputs of the model."""
+    rays = pipeline.datamanager.eval_dataset.cameras[:1].generate_rays(camera_indices=0, keep_shape=True)
+    steps = torch.full((*rays.shape, 1), 2.0)
+    steps[:, : rays.shape[1] // 2] = 1.0
+    monkeypatch.setattr(pipeline.model, "depth_evidence", lambda rays, depth: (torch.ones_like(depth), depth))
+    confidence, spread = depth_evidence(pipeline.model, rays, steps, torch.ones_like(steps), scale=0.4)
+    assert (
+        not confidence[:, rays.shape[1] // 2 - 1].any()
+        and confidence.count_nonzero() == (rays.shape[1] - 1) * rays.shape[0]
+    )
+    torch.testing.assert_close(spread, steps, rtol=0.01, atol=0)
+    monkeypatch.setattr(Model, "get_outputs_for_camera_ray_bundle", lambda *_: {"depth": steps})
+    assert torch.equal(pipeline.model.get_outputs_for_camera_ray_bundle(rays)["confidence"], confidence)
 
 
 def test_a_model_renders_its_confidence_when_it_is_asked_for_and_events_lower_it(pipeline: Any):
