@@ -17,6 +17,7 @@ from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.export.open3d_library import open3d
 from enerf_ns.method.pipeline import EnerfPipeline
 from enerf_ns.poses.posed_camera import PosedCamera
+from enerf_ns.rendering.spread_depth import depth_evidence
 
 NUM_VIEWS = 40
 """Number of views that are fused, spread evenly over the trajectory."""
@@ -24,6 +25,10 @@ NUM_VIEWS = 40
 SURE = 0.15
 """Confidence from which depth is fused. It is lower than for scores, because views are averaged. A lower value makes
 the surface more complete and less accurate. The Chamfer distance is least at 0.15 to 0.3."""
+
+SMOOTHNESS = 10.0
+"""Smoothness of the depth that is fused (`spread_depth`). It is lower than for one picture: views average what differs
+between them, but not what smoothness gets wrong in all of them."""
 
 VOXEL_PIXELS = 1.5
 """Default side of a voxel, as a multiple of the size of a pixel at the median known depth."""
@@ -54,7 +59,7 @@ class SurfaceView:
     pose: Float64[np.ndarray, "3 4"]
     """Camera to world, OpenCV axes, metres."""
     depth: Float32[np.ndarray, "height width"]
-    """Rendered depth along the optical axis, metres."""
+    """Spread depth along the optical axis, metres."""
     known: Bool[np.ndarray, "height width"]
     """Whether the confidence of the depth is at least `SURE`."""
     brightness: Float32[np.ndarray, "height width 3"]
@@ -87,10 +92,12 @@ def surface_views(pipeline: EnerfPipeline, number: int = NUM_VIEWS) -> tuple[Cam
         times = torch.full_like(pixels, int(time))
         rays = posed.rays(pixels, times).reshape((camera.height, camera.width))
         shown = model.get_outputs_for_camera_ray_bundle(rays)
-        depth = (shown["depth"] / rays.metadata["directions_norm"])[..., 0].cpu() / scale
-        known = (shown["confidence"][..., 0].cpu() >= SURE) & (depth > 0.0) & depth.isfinite()
+        brightness = shown["rgb"].cpu()
+        depth = (shown["depth"] / rays.metadata["directions_norm"]).cpu() / scale
+        confidence, spread = depth_evidence(model, rays, depth, brightness, scale, SMOOTHNESS)
         pose = recording.trajectory.poses(torch.as_tensor(int(time))).numpy()
-        views.append(SurfaceView(pose, depth.numpy(), known.numpy(), shown["rgb"].cpu().numpy()))
+        known = (confidence >= SURE) & (spread > 0.0) & spread.isfinite()
+        views.append(SurfaceView(pose, spread[..., 0].numpy(), known[..., 0].numpy(), brightness.numpy()))
     return camera, views
 
 

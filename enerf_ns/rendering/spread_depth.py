@@ -21,7 +21,7 @@ EDGE_OF_DEPTH = 0.02
 """Difference of log depth between neighbours that weakens spreading by a factor of e."""
 
 SMOOTHNESS = 100.0
-"""Weight of smoothness relative to depth of confidence 1."""
+"""Weight of smoothness at which the depth of one picture is nearest to the true depth."""
 
 PASSES, ATTENUATION = 3, 0.25
 """Number of passes along rows and columns, and the factor of smoothness from one pass to the next."""
@@ -47,6 +47,7 @@ def depth_evidence(
     depth: Float[Tensor, "height width 1"],
     brightness: Float[Tensor, "height width channels"],
     scale: float,
+    smoothness: float = SMOOTHNESS,
 ) -> tuple[Float[Tensor, "height width 1"], Float[Tensor, "height width 1"]]:
     """Returns the confidence in the depth of a picture, and the depth spread from pixels of high confidence.
 
@@ -56,6 +57,7 @@ def depth_evidence(
         depth: Rendered depth along the optical axis, in metres.
         brightness: Rendered linear brightness, 0 or more.
         scale: Scene units per metre.
+        smoothness: As in `spread_depth`.
 
     Returns:
         Confidence from 0 to 1 (`EnerfModel.depth_evidence`), which is 0 at rims (`is_rim`), and `spread_depth` along
@@ -63,7 +65,7 @@ def depth_evidence(
     """
     along = scale * rays.metadata["directions_norm"].to(depth.device)
     confidence, far = model.depth_evidence(rays, depth * along)
-    return confidence * ~is_rim(depth), spread_depth(depth, far / along, confidence, brightness)
+    return confidence * ~is_rim(depth), spread_depth(depth, far / along, confidence, brightness, smoothness)
 
 
 def spread_depth(
@@ -71,6 +73,7 @@ def spread_depth(
     far_depth: Float[Tensor, "height width 1"],
     confidence: Float[Tensor, "height width 1"],
     brightness: Float[Tensor, "height width channels"],
+    smoothness: float = SMOOTHNESS,
 ) -> Float[Tensor, "height width 1"]:
     """Returns the depth where it is known, and depth spread from known pixels elsewhere.
 
@@ -84,6 +87,7 @@ def spread_depth(
         far_depth: The far depth of `EnerfModel.depth_evidence`, in the same unit and direction.
         confidence: Confidence in depth, from 0 to 1.
         brightness: Linear brightness, 0 or more.
+        smoothness: Weight of smoothness relative to depth of confidence 1.
 
     Returns:
         Depth in the unit and direction of `depth`. It is `depth` itself if any depth is not finite or not above 0.
@@ -102,7 +106,7 @@ def spread_depth(
 
     def smooth(picture: np.ndarray) -> np.ndarray:
         return cv2.ximgproc.fastGlobalSmootherFilter(
-            guide, picture, SMOOTHNESS, LEVELS_AN_EDGE, lambda_attenuation=ATTENUATION, num_iter=PASSES
+            guide, picture, smoothness, LEVELS_AN_EDGE, lambda_attenuation=ATTENUATION, num_iter=PASSES
         )
 
     spread = smooth(weight) / smooth(weight * inverse)

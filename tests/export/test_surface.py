@@ -109,10 +109,13 @@ def test_a_point_of_the_recording_is_found_again_in_metres_and_its_axes(
     def shown(rays: Any) -> dict[str, torch.Tensor]:
         along = torch.from_numpy(normal).float()
         depth = (offset - rays.origins @ along) / (rays.directions @ along)
-        ones = torch.ones((*rays.shape, 1))
-        return {"rgb": 0.5 * ones.expand(*rays.shape, 3), "depth": depth[..., None], "confidence": ones}
+        return {"rgb": torch.full((*rays.shape, 3), 0.5), "depth": depth[..., None]}
+
+    def sure(rays: Any, depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.ones_like(depth), depth
 
     monkeypatch.setattr(pipeline.model, "get_outputs_for_camera_ray_bundle", shown)
+    monkeypatch.setattr(pipeline.model, "depth_evidence", sure)
     camera, views = surface_views(pipeline, 3)
     cloud = points_of(camera, views, 0.01)
     np.testing.assert_allclose(cloud.vertices[:, 1].mean(), level, atol=0.01)

@@ -118,14 +118,12 @@ def test_the_evidence_of_a_picture_is_of_metres_along_the_optical_axis(pipeline:
 def test_there_is_no_confidence_at_rims_whose_depth_is_spread(pipeline: Any, monkeypatch: pytest.MonkeyPatch):
     """In the evidence of a picture, and in the outputs of the model."""
     rays = pipeline.datamanager.eval_dataset.cameras[:1].generate_rays(camera_indices=0, keep_shape=True)
-    steps = torch.full((*rays.shape, 1), 2.0)
-    steps[:, : rays.shape[1] // 2] = 1.0
+    height, width = rays.shape
+    steps = torch.full((height, width, 1), 2.0)
+    steps[:, : width // 2] = 1.0
     monkeypatch.setattr(pipeline.model, "depth_evidence", lambda rays, depth: (torch.ones_like(depth), depth))
     confidence, spread = depth_evidence(pipeline.model, rays, steps, torch.ones_like(steps), scale=0.4)
-    assert (
-        not confidence[:, rays.shape[1] // 2 - 1].any()
-        and confidence.count_nonzero() == (rays.shape[1] - 1) * rays.shape[0]
-    )
+    assert not confidence[:, width // 2 - 1].any() and confidence.count_nonzero() == height * (width - 1)
     torch.testing.assert_close(spread, steps, rtol=0.01, atol=0)
     monkeypatch.setattr(Model, "get_outputs_for_camera_ray_bundle", lambda *_: {"depth": steps})
     assert torch.equal(pipeline.model.get_outputs_for_camera_ray_bundle(rays)["confidence"], confidence)
