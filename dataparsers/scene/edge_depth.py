@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -83,10 +84,12 @@ class EdgeView:
         return replace(self, depth=np.where(kept, self.depth, 0), confidence=np.where(kept, self.confidence, 0))
 
 
+@cache
 def edge_depth(
     recording: EventRecording, depth_range: tuple[float, float], num_views: int = NUM_VIEWS
 ) -> list[EdgeView]:
-    """Depth of the edges in reference views along the trajectory. It takes about 0.2 s of one core for each view.
+    """Depth of the edges in reference views along the trajectory. It takes about 0.2 s of one core for each view, once
+    for each recording and range in a process.
 
     This is event-based multi-view stereo (Rebecq et al., "EMVS", IJCV 2018): planes of a reference view collect votes
     from the viewing rays of events, which meet at the edges. The depth of a pixel is that of the plane where the
