@@ -46,6 +46,13 @@ def test_edges_lie_where_the_points_are(unit: float):
     assert np.mean(nearest < 0.02 * unit) > 0.35  # points beside each other in different depths are left out
 
 
+def test_edges_of_a_recording_are_found_once_for_each_range():
+    """The choice whether to start from them, and the start, ask for the same."""
+    recording = recording_of(points_between(1.0, 3.0), MOTION)
+    assert edge_depth(recording, (0.7, 4.0)) is edge_depth(recording, (0.7, 4.0))
+    assert edge_depth(recording, (0.7, 4.0)) is not edge_depth(recording, (0.7, 5.0))
+
+
 def test_points_and_depth_say_the_same():
     view = edge_depth(recording_of(points_between(1.0, 3.0), MOTION), (0.7, 4.0), num_views=3)[1]
     seen = (view.points - view.pose[:, 3]) @ view.pose[:, :3]
