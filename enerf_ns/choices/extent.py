@@ -23,6 +23,12 @@ SMALLEST_GROWTH = 1.4
 """Smallest factor by which a level of the hash grid is finer than the one before; closer levels hold nearly the
 same."""
 
+ENTRIES_PER_PIXEL = 12
+"""Entries of each level of the hash grid for each pixel of the sensor. With fewer, many surfaces share an entry."""
+
+SMALLEST_TABLE, LARGEST_TABLE = 17, 19
+"""Base-2 logarithms of the smallest and of the largest number of entries that is chosen for a level."""
+
 
 def undistortion(scene: Scene) -> None:
     """Are rays and frames undistorted?"""
@@ -100,10 +106,15 @@ def hash_grid(scene: Scene) -> None:
     footprint = distance / scene.recording.camera.fx
     finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
     resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))
+    pixels = scene.recording.camera.width * scene.recording.camera.height
+    sought = round(math.log2(ENTRIES_PER_PIXEL * pixels))
+    log2_entries = scene.use("model.log2_table_size", lambda: min(max(sought, SMALLEST_TABLE), LARGEST_TABLE))
     name = "model.num_levels"
     ratio = max(resolution / coarsest, 1.0)
     levels = scene.use(name, lambda: min(1 + round(math.log(ratio) / math.log(SMALLEST_GROWTH)), MOST_LEVELS))
     growth = ratio ** (1 / (levels - 1)) if levels > 1 else 1.0
     why = f"as fine as the sensor's pixels, each level {growth:.2f} times as fine as the one before"
-    why = scene.why("model.max_res" if scene.config.model.max_res is not None else name, why)
-    scene.row("hash grid", True, f"{levels} levels, {coarsest} to {resolution} cells", why, name)
+    given = (one for one in ("model.max_res", "model.log2_table_size") if scene.given(one) is not None)
+    why = scene.why(next(given, name), why)
+    value = f"{levels} levels of 2^{log2_entries} entries, {coarsest} to {resolution} cells"
+    scene.row("hash grid", True, value, why, name)

@@ -98,8 +98,9 @@ class EnerfModelConfig(ModelConfig):
     max_res: Optional[int] = None  # noqa: UP045
     """Cells along the box at the finest level of the hash grid. Default: cells as large as a pixel of the sensor on the
     scene."""
-    log2_table_size: int = 17
-    """Base-2 logarithm of the entries of each level of the hash grid."""
+    log2_table_size: Optional[int] = None  # noqa: UP045
+    """Base-2 logarithm of the entries of each level of the hash grid. Default: about twelve entries for each pixel of
+    the sensor, from 17 to 19."""
     hash_grid: str = "auto"
     """Backend that computes the hash grid: triton (GPU), numba (CPU), torch (any device, slow), or auto, the fastest
     that fits the device. Results differ by rounding alone, and checkpoints fit all backends."""
@@ -237,7 +238,8 @@ class EnerfModel(Model):
     def populate_modules(self) -> None:
         super().populate_modules()
         config = self.config
-        assert config.max_res and config.num_levels and config.num_channels and config.near_plane is not None
+        assert config.max_res and config.num_levels and config.log2_table_size
+        assert config.num_channels and config.near_plane is not None
         assert config.contraction is not None
         assert (
             config.sampling

@@ -324,6 +324,7 @@ def test_windows_are_as_long_as_is_said(recording: Path, mode: str, window_ms: f
         ("model__view_direction", True, "view direction"),
         ("data__silent_pairs", 5, "silent pixels"),
         ("model__num_levels", 4, "hash grid"),
+        ("model__log2_table_size", 12, "hash grid"),
         ("model__num_channels", 1, "colour"),
     ],
 )
@@ -660,3 +661,16 @@ def test_levels_of_the_grid_are_never_closer_than_they_help(recording: Path, max
     config.model.max_res = max_res
     assert resolve(config, read_recording(recording)).values["model.num_levels"] == levels
     assert levels == 1 or (max_res / 16) ** (1 / (levels - 1)) >= 1.39
+
+
+@pytest.mark.parametrize(
+    ("size", "entries"), [((32, 24), 2**17), ((160, 120), 2**18), ((240, 180), 2**19), ((640, 480), 2**19)]
+)
+def test_a_table_has_about_twelve_entries_for_each_pixel(recording: Path, size: tuple[int, int], entries: int):
+    """Between the smallest and the largest table, to the nearest power of two."""
+    resized = replace(read_recording(recording), camera=Camera(*size, 30.0, 31.0, 15.5, 11.5))
+    resolution = resolve(copy.deepcopy(ENERF), resized)
+    log2_entries = resolution.values["model.log2_table_size"]
+    assert 2**log2_entries == entries
+    assert 12 / 2**0.5 < entries / (size[0] * size[1]) < 12 * 2**0.5 or log2_entries in (17, 19)
+    assert f"levels of 2^{log2_entries} entries" in rows(resolution)["hash grid"].value
