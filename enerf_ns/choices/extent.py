@@ -24,7 +24,8 @@ SMALLEST_GROWTH = 1.4
 same."""
 
 ENTRIES_PER_PIXEL = 12
-"""Entries of each level of the hash grid for each pixel of the sensor. With fewer, many surfaces share an entry."""
+"""Entries of each level of the hash grid for each pixel of the sensor. With fewer, cells that share an entry lose fine
+detail."""
 
 SMALLEST_TABLE, LARGEST_TABLE = 17, 19
 """Base-2 logarithms of the smallest and of the largest number of entries that is chosen for a level."""

@@ -674,3 +674,11 @@ def test_a_table_has_about_twelve_entries_for_each_pixel(recording: Path, size: 
     assert 2**log2_entries == entries
     assert 12 / 2**0.5 < entries / (size[0] * size[1]) < 12 * 2**0.5 or log2_entries in (17, 19)
     assert f"levels of 2^{log2_entries} entries" in rows(resolution)["hash grid"].value
+
+
+@pytest.mark.parametrize("setting", ["max_res", "log2_table_size", "num_levels"])
+def test_each_flag_of_the_hash_grid_is_said_to_be_one(recording: Path, setting: str):
+    config = copy.deepcopy(ENERF)
+    assert rows(resolve(config, read_recording(recording)))["hash grid"].why != "set by flag"
+    setattr(config.model, setting, 16)
+    assert rows(resolve(config, read_recording(recording)))["hash grid"].why == "set by flag"
