@@ -30,6 +30,8 @@ def test_links_lead_somewhere(page: Path):
         target = (page.parent / file).resolve() if file else page
         assert target.is_file(), f"{page.name}: {link}"
         assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
+        is_on_the_site = target.suffix != ".md" or target.parent == ROOT / "docs"
+        assert is_on_the_site or page.parent != ROOT / "docs", f"{page.name}: {link} is a page outside the site"
 
 
 def test_every_page_is_in_the_side_bar_and_the_readme_is_short():
