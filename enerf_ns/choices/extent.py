@@ -23,11 +23,11 @@ SMALLEST_GROWTH = 1.4
 """Smallest factor by which a level of the hash grid is finer than the one before; closer levels hold nearly the
 same."""
 
-ENTRIES_PER_PIXEL = 12
-"""Entries of each level of the hash grid for each pixel of the sensor. With fewer, cells that share an entry lose fine
-detail."""
+ENTRIES_BY_ROOT_OF_PIXELS = 2000
+"""Entries of each level of the hash grid, divided by the square root of the number of the sensor's pixels. With fewer,
+cells that share an entry lose fine detail. With more, a step takes longer, and small sensors gain little."""
 
-SMALLEST_TABLE, LARGEST_TABLE = 17, 19
+SMALLEST_TABLE, LARGEST_TABLE = 17, 20
 """Base-2 logarithms of the smallest and of the largest number of entries that is chosen for a level."""
 
 
@@ -108,7 +108,7 @@ def hash_grid(scene: Scene) -> None:
     finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
     resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))
     pixels = scene.recording.camera.width * scene.recording.camera.height
-    sought = round(math.log2(ENTRIES_PER_PIXEL * pixels))
+    sought = round(math.log2(ENTRIES_BY_ROOT_OF_PIXELS * math.sqrt(pixels)))
     log2_entries = scene.use("model.log2_table_size", lambda: min(max(sought, SMALLEST_TABLE), LARGEST_TABLE))
     name = "model.num_levels"
     ratio = max(resolution / coarsest, 1.0)

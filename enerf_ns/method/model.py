@@ -99,8 +99,8 @@ class EnerfModelConfig(ModelConfig):
     """Cells along the box at the finest level of the hash grid. Default: cells as large as a pixel of the sensor on the
     scene."""
     log2_table_size: Optional[int] = None  # noqa: UP045
-    """Base-2 logarithm of the entries of each level of the hash grid. Default: about twelve entries for each pixel of
-    the sensor, from 17 to 19."""
+    """Base-2 logarithm of the entries of each level of the hash grid. Default: about 2000 times the square
+    root of the number of the sensor's pixels, from 17 to 20."""
     hash_grid: str = "auto"
     """Backend that computes the hash grid: triton (GPU), numba (CPU), torch (any device, slow), or auto, the fastest
     that fits the device. Results differ by rounding alone, and checkpoints fit all backends."""

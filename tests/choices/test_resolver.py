@@ -664,15 +664,17 @@ def test_levels_of_the_grid_are_never_closer_than_they_help(recording: Path, max
 
 
 @pytest.mark.parametrize(
-    ("size", "entries"), [((32, 24), 2**17), ((160, 120), 2**18), ((240, 180), 2**19), ((640, 480), 2**19)]
+    ("size", "log2_expected"),
+    [((32, 24), 17), ((160, 120), 18), ((240, 180), 19), ((346, 260), 19), ((640, 480), 20), ((1280, 720), 20)],
 )
-def test_a_table_has_about_twelve_entries_for_each_pixel(recording: Path, size: tuple[int, int], entries: int):
+def test_a_table_grows_with_the_side_of_the_sensor(recording: Path, size: tuple[int, int], log2_expected: int):
     """Between the smallest and the largest table, to the nearest power of two."""
     resized = replace(read_recording(recording), camera=Camera(*size, 30.0, 31.0, 15.5, 11.5))
     resolution = resolve(copy.deepcopy(ENERF), resized)
     log2_entries = resolution.values["model.log2_table_size"]
-    assert 2**log2_entries == entries
-    assert 12 / 2**0.5 < entries / (size[0] * size[1]) < 12 * 2**0.5 or log2_entries in (17, 19)
+    assert log2_entries == log2_expected
+    relative = 2**log2_entries / (2000 * (size[0] * size[1]) ** 0.5)
+    assert 2**-0.5 < relative < 2**0.5 or (log2_entries == 17 and relative > 1) or (log2_entries == 20 and relative < 1)
     assert f"levels of 2^{log2_entries} entries" in rows(resolution)["hash grid"].value
 
 

@@ -15,7 +15,7 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
 import enerf_ns
-from enerf_ns.choices.extent import LARGEST_TABLE, MOST_LEVELS
+from enerf_ns.choices.extent import MOST_LEVELS
 from enerf_ns.dataparsers import event_dataparser
 from enerf_ns.dataparsers.event_dataparser import EventDataParser, EventDataParserConfig
 from enerf_ns.method.config import DecayOverRunSchedulerConfig, FusedAdamOptimizerConfig, enerf, enerf_paper
@@ -41,7 +41,7 @@ def test_the_paper_is_larger_in_every_way():
     paper: Any = enerf_paper.config
     assert paper.pipeline.defaults.event_pairs > tuned.pipeline.defaults.event_pairs
     assert paper.pipeline.model.num_samples > tuned.pipeline.model.num_samples
-    assert paper.pipeline.model.num_levels > MOST_LEVELS and paper.pipeline.model.log2_table_size >= LARGEST_TABLE
+    assert paper.pipeline.model.num_levels > MOST_LEVELS and paper.pipeline.model.log2_table_size == 19
     assert paper.max_num_iterations > tuned.max_num_iterations
 
 
