@@ -74,6 +74,9 @@ class EventDataParserConfig(DataParserConfig):
     box: Optional[Tuple[float, float, float, float]] = None  # noqa: UP006, UP045
     """Cube around the scene: x y z of its middle and half its side, metres. Default: the box of all that the cameras
     see."""
+    contraction_depth: Optional[float] = None  # noqa: UP045
+    """Depth from which methods that contract space do so, metres: up to it, cells of a field are of even size.
+    Default: with enerf, four times the nearest depth, if the farthest is beyond; else the farthest."""
     time_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """First and last second to use, on the recording's clock. Default: the whole recording."""
     keep_hot_pixels: bool = False
@@ -146,7 +149,8 @@ class EventDataParser(DataParser):
             FlagError: The frames cannot be downscaled by this factor.
         """
         near, far = depth_range_or_cause(recording, self.config.depth_range)
-        transform, scale, box = scene_normalisation(recording, near, far, self.config.box)
+        limits = self.config.box, self.config.contraction_depth
+        transform, scale, box = scene_normalisation(recording, near, far, *limits)
         frames, are_frames = split_frames(recording, self.config, held_out=split != "train")
 
         return EventDataparserOutputs(

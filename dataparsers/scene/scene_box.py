@@ -10,10 +10,16 @@ from enerf_ns.dataparsers.recording.recording import EventRecording
 
 
 def scene_normalisation(
-    recording: EventRecording, near: float, far: float, cube: tuple[float, float, float, float] | None = None
+    recording: EventRecording,
+    near: float,
+    far: float,
+    cube: tuple[float, float, float, float] | None = None,
+    contraction_depth: float | None = None,
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Transform and scale from the world to the scene, and the box of all that the event camera sees in the depth
     range.
+
+    Contraction leaves [-1, 1] as it is. So what the camera sees up to the depth of contraction is moved there.
 
     Args:
         recording: Its camera is placed at all poses that are used.
@@ -21,11 +27,13 @@ def scene_normalisation(
         far: Farthest depth, metres.
         cube: Middle (x, y, z) and half side, metres, of a cube along the axes of the world that holds the scene.
             Default: the box of all that the camera sees.
+        contraction_depth: Depth from which space is contracted, metres. Default: the farthest. A cube takes its place.
 
     Returns:
         transform (3, 4) and scale: a world point p lies at scale * (transform @ [p, 1]) in the scene. The transform
-        turns the mean up direction of the cameras to +z, and moves the middle of the box to the origin. The box (2, 3)
-        is in scene units, and its longest side is 2. With a cube, the transform does not turn the world.
+        turns the mean up direction of the cameras to +z, and moves the middle of the box that reaches to the depth of
+        contraction to the origin. The longest side of that box is 2. The box (2, 3) of all depths is in scene units.
+        With a cube, the transform does not turn the world.
     """
     if cube is not None:
         return np.column_stack([np.eye(3), -np.array(cube[:3])]), 1.0 / cube[3], np.array([[-1.0] * 3, [1.0] * 3])
@@ -39,11 +47,12 @@ def scene_normalisation(
     rows = np.linspace(0, camera.height - 1, 5).astype(int)
     columns = np.linspace(0, camera.width - 1, 5).astype(int)
     directions = camera.pixel_directions()[np.ix_(rows, columns)].reshape(-1, 3)
-    points = np.concatenate([directions * near, directions * far])
-    seen = np.einsum("nij,mj->nmi", poses[:, :, :3], points) + poses[:, None, :, 3]
-    seen = seen.reshape(-1, 3) @ rotation.T
-    low, high = seen.min(axis=0), seen.max(axis=0)
+    end = far if contraction_depth is None else min(max(contraction_depth, near), far)
+    seen = np.einsum("nij,dmj->dnmi", poses[:, :, :3], np.array([near, end, far])[:, None, None] * directions)
+    seen = (seen + poses[:, None, :, 3]) @ rotation.T
+    low, high = (found(seen[:2], axis=(0, 1, 2)) for found in (np.min, np.max))
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     scale = 1.0 / half.max()
     transform = np.concatenate([rotation, -middle[:, None]], axis=1)
-    return transform, float(scale), np.stack([-half, half]) * scale
+    corners = np.stack([found(seen, axis=(0, 1, 2)) for found in (np.min, np.max)])
+    return transform, float(scale), (corners - middle) * scale

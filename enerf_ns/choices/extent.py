@@ -13,6 +13,10 @@ from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 SHARE_BEYOND = 0.05
 """Smallest share of the events from beyond the box for which the space there is rendered."""
 
+EVEN_RANGE = 4.0
+"""Ratio of depths up to which space is not contracted. A pixel covers more of what is farther, and depth is less exact
+there, so that cells and samples of even size are too coarse for what is near, or finer than needed for what is far."""
+
 LARGEST_RESOLUTION = 4096
 """Largest number of cells along the box that is chosen for the finest level of the hash grid."""
 
@@ -84,26 +88,39 @@ def explainable(scene: Scene) -> None:
 
 def scale(scene: Scene) -> float:
     """Units of the network per metre."""
-    return scene_normalisation(scene.recording, *scene.once(depths), scene.value(f"{DATAPARSER}.box"))[1]
+    limits = scene.value(f"{DATAPARSER}.box"), scene.once(contraction_depth)
+    return scene_normalisation(scene.recording, *scene.once(depths), *limits)[1]
+
+
+def contraction_depth(scene: Scene) -> float:
+    """Depth from which space is contracted, m; the farthest if the cells of all of the box are of even size."""
+    near, far = scene.once(depths)
+    is_even = scene.given("model.contraction") is False or scene.value("model.panorama")
+    is_even = is_even or scene.value(f"{DATAPARSER}.box") is not None or far <= EVEN_RANGE * near
+    end = scene.use(f"{DATAPARSER}.contraction_depth", lambda: None if is_even else EVEN_RANGE * near)
+    return far if end is None else min(end, far)
 
 
 def contraction(scene: Scene) -> None:
-    """Does the scene go on beyond the box?"""
-    name, near_far = "model.contraction", scene.once(depths)
+    """Does the scene go on beyond the box, or is its depth of so large a range that cells may not be even?"""
+    name, (near, far) = "model.contraction", scene.once(depths)
     if scene.value("model.panorama"):
         scene.use(name, lambda: False)
         return
-    is_set = scene.value(f"{DATAPARSER}.box") is not None
-    share = 0.0 if is_set else share_beyond(scene.once(corrected_recording), near_far)
-    kept = scene.use(name, lambda: share > SHARE_BEYOND)
-    why = "the box is set" if is_set else f"{100 * share:.1f} % of the events come from beyond {near_far[1]:.3g} m"
-    scene.row("contraction", kept, "space beyond the box" * kept, scene.why(name, why), name)
+    is_set, end = scene.value(f"{DATAPARSER}.box") is not None, scene.once(contraction_depth)
+    share = 0.0 if is_set else share_beyond(scene.once(corrected_recording), (near, far))
+    kept = scene.use(name, lambda: share > SHARE_BEYOND or end < far)
+    why = f"{100 * share:.1f} % of the events come from beyond {far:.3g} m"
+    if end < far:
+        why = f"the farthest depth is {far / near:.3g} times the nearest, and {why}"
+    why = scene.why(name, "the box is set" if is_set else why)
+    scene.row("contraction", kept, f"space beyond a depth of {end:.3g} m" * kept, why, name)
 
 
 def hash_grid(scene: Scene) -> None:
     """How fine is the hash grid?"""
-    (near, far), coarsest = scene.once(depths), scene.config.model.base_res
-    distance = 2.0 if scene.value("model.panorama") else math.sqrt(near * far) * scene.once(scale)
+    near, end, coarsest = scene.once(depths)[0], scene.once(contraction_depth), scene.config.model.base_res
+    distance = 2.0 if scene.value("model.panorama") else math.sqrt(near * end) * scene.once(scale)
     footprint = distance / scene.recording.camera.fx
     finest = 2 ** round(math.log2(2.0 * 2.0 / footprint))
     resolution = scene.use("model.max_res", lambda: min(max(finest, 2 * coarsest), LARGEST_RESOLUTION))

@@ -57,6 +57,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "downscale_factor": (1.0, LARGEST_SIDE),
     "depth_range": DEPTH_LIMITS,
     "box": (-DEPTH_LIMITS[1], DEPTH_LIMITS[1]),
+    "contraction_depth": DEPTH_LIMITS,
     "time_range": (-4e9, 4e9),  # in ns, differences of int64 hold them
     "train_frame_indices": COUNT,
     "held_out_frame_indices": COUNT,

@@ -170,7 +170,8 @@ class EnerfModelConfig(ModelConfig):
     Default: True where the camera only turns, unless a depth range is set."""
     contraction: Optional[bool] = None  # noqa: UP045
     """Contract the space beyond the box, out to infinity, as mip-NeRF 360 does. Without contraction the space beyond
-    the box is empty. Default: True where a share of the events comes from beyond the box."""
+    the box is empty. Default: True where a share of the events comes from beyond the box, or where the farthest depth
+    is more than four times the nearest."""
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. Default: the near end of the recording's depths."""
 
@@ -455,7 +456,7 @@ class EnerfModel(Model):
         """
         assert self.config.max_res is not None
         corners = points.new_tensor([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]])
-        size = 2.0 * float((self.scene_box.aabb[1] - self.scene_box.aabb[0]).max()) / self.config.max_res
+        size = 4.0 / self.config.max_res
         density = self.field.geometry.density_fn(points[:, None] + size * corners)
         gradient = torch.sum(torch.log(density + 1e-6) * corners, dim=1)
         return 0.5 - 0.5 * torch.nn.functional.normalize(gradient, dim=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
+from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 from enerf_ns.method.config import enerf, enerf_paper
 from enerf_ns.sensor.response import Logarithm
 
@@ -563,7 +565,7 @@ def test_what_events_span_decides_whether_brightness_has_a_limit(recording: Path
 
 def test_events_from_beyond_the_box_decide_on_contraction():
     generator = np.random.default_rng(4)
-    depths = np.exp(generator.uniform(0.0, np.log(2.0), (400, 1)))
+    depths = np.exp(generator.uniform(0.0, np.log(1.5), (400, 1)))
     for far_points in (0, 240):
         depths[:far_points] = 300.0
         points = depths * np.append(generator.uniform(-0.6, 0.6, (400, 2)), np.ones((400, 1)), axis=1)
@@ -573,6 +575,35 @@ def test_events_from_beyond_the_box_decide_on_contraction():
         row = rows(resolution)["contraction"]
         assert row.kept == resolution.values["model.contraction"] == bool(far_points)
         assert "come from beyond" in row.why
+
+
+@pytest.mark.parametrize(
+    ("far", "settings", "end"),
+    [
+        (3.9, {}, None),
+        (4.1, {}, 4.0),
+        (60.0, {}, 4.0),
+        (60.0, {"datamanager.dataparser.contraction_depth": 10.0}, 10.0),
+        (60.0, {"datamanager.dataparser.contraction_depth": 60.0}, None),
+        (60.0, {"datamanager.dataparser.box": (0.0, 0.0, 0.0, 30.0)}, None),
+        (60.0, {"model.contraction": False}, None),
+    ],
+)
+def test_a_large_range_of_depths_decides_on_contraction(recording: Path, far: float, settings: dict, end: float | None):
+    """Cells are even up to four times the nearest depth, unless a flag says otherwise."""
+    config = copy.deepcopy(ENERF)
+    for name, value in settings.items():
+        place, _, setting = name.rpartition(".")
+        setattr(attrgetter(place)(config), setting, value)
+    made = replace(read_recording(recording), depth_range=(1.0, far))
+    resolution = resolve(config, made)
+    row = rows(resolution)["contraction"]
+    assert row.kept == (end is not None)
+    assert row.value == ("" if end is None else f"space beyond a depth of {end:.3g} m")
+    near_plane = resolution.values["model.near_plane"]
+    _, scale, box = scene_normalisation(made, 1.0, far, config.datamanager.dataparser.box, end)
+    assert near_plane == pytest.approx(scale)
+    assert (np.ptp(box, axis=0).max() > 2.01) == (end is not None)
 
 
 def test_a_clock_that_is_corrected_moves_no_event_beyond_the_box():

@@ -31,6 +31,22 @@ def test_the_box_holds_what_the_camera_sees_between_near_and_far(tmp_path: Path)
     assert (np.ptp(points, axis=0) > 0.9 * np.ptp(box, axis=0)).all(), "the box is not much larger than that"
 
 
+def test_what_the_camera_sees_before_the_depth_of_contraction_lies_in_the_box_that_it_leaves(tmp_path: Path):
+    recording = read_recording(write_davis(tmp_path / "davis"))
+    near_part = scene_normalisation(recording, NEAR, 1.5)
+    transform, scale, box = scene_normalisation(recording, NEAR, FAR, contraction_depth=1.5)
+    np.testing.assert_allclose(transform, near_part[0], atol=1e-12)
+    assert scale == pytest.approx(near_part[1])
+    even_transform, even_scale, even_box = scene_normalisation(recording, NEAR, FAR)
+    for corner, even_corner in zip(box, even_box, strict=True):
+        in_world, expected = corner / scale - transform[:, 3], even_corner / even_scale - even_transform[:, 3]
+        np.testing.assert_allclose(in_world, expected, atol=1e-9)
+    for depth in (0.01, FAR, 100.0):
+        limited = scene_normalisation(recording, NEAR, FAR, contraction_depth=depth)
+        expected = scene_normalisation(recording, NEAR, min(max(depth, NEAR), FAR))
+        assert limited[1] == pytest.approx(expected[1])
+
+
 def test_a_box_is_a_cube_of_the_world(tmp_path: Path):
     folder = write_esim(tmp_path / "esim")
     config = EventDataParserConfig(data=folder, depth_range=(NEAR, FAR), box=(2.0, 1.0, -3.0, 4.0))
