@@ -20,7 +20,7 @@ from torch import Tensor
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.datamanager import EnerfDataManager
-from enerf_ns.method.model import EnerfModel, Outputs
+from enerf_ns.method.model import FARTHEST, EnerfModel, Outputs
 from enerf_ns.method.nerfstudio_seams import replace_camera_callbacks, replace_renderer, tidy_control_panel
 from enerf_ns.method.viewer.overlay import draw_events, for_the_eye, recent_events, unknown
 from enerf_ns.method.viewer.seen_rays import SeenRays
@@ -373,9 +373,11 @@ class SceneView(ViewerControl):
             self._corrected.content = self._corrections_in_words
         if step > 0 and not self._showed_trained:
             self._showed_trained, self._shows_edges.value = True, False
-        if self._seen is None or model.is_unbounded:
+        if self._seen is None or model.config.panorama:
             return
-        nears, fars = self._seen.span(rays.origins, rays.directions)
+        assert model.config.near_plane is not None
+        beyond = (model.config.near_plane, FARTHEST) if model.is_unbounded else None
+        nears, fars = self._seen.span(rays.origins, rays.directions, beyond)
         if rays.nears is not None and rays.fars is not None:
             nears, fars = torch.maximum(nears, rays.nears), torch.minimum(fars, rays.fars)
         rays.nears, rays.fars = nears, fars

@@ -49,16 +49,21 @@ class SeenRays:
         return found
 
     def span(
-        self, origins: Float[Tensor, "height width 3"], directions: Float[Tensor, "height width 3"]
+        self,
+        origins: Float[Tensor, "height width 3"],
+        directions: Float[Tensor, "height width 3"],
+        beyond: tuple[float, float] | None = None,
     ) -> tuple[Float[Tensor, "height width 1"], Float[Tensor, "height width 1"]]:
         """Near and far distances between which the rays of a picture pass seen voxels, with some margin.
 
         Args:
             origins: Origins of the rays, scene units.
             directions: Directions of the rays, of length 1.
+            beyond: Nearest and farthest distance of a sample where surfaces may lie beyond the box. Rays then end at
+                the farthest, and those that pass no seen voxel begin at the nearest.
 
         Returns:
-            Two tensors in scene units; both are `NOWHERE` for rays that pass no seen voxel.
+            Two tensors in scene units; without `beyond`, both are `NOWHERE` for rays that pass no seen voxel.
         """
         height, width = origins.shape[:2]
         step = -(-max(height, width) // COARSE)
@@ -78,4 +83,6 @@ class SeenRays:
             for side, number in zip((height, width), nears.shape, strict=True)
         )
         nears, fars = around[:, rows][:, :, columns, None]
+        if beyond is not None:
+            return (-nears).where(nears > -NOWHERE, beyond[0]), torch.full_like(fars, beyond[1])
         return -nears, fars.where(fars > 0.0, NOWHERE)

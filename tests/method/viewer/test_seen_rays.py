@@ -28,6 +28,10 @@ def test_rays_begin_and_end_around_what_was_seen():
     assert ((fars[above] >= 3.25) & (fars[above] < 3.25 + 3 * VOXEL)).all()
     assert (nears[below] == NOWHERE).all() and (fars[below] == NOWHERE).all()
 
+    unbounded = half_seen().span(origins, directions, beyond=(0.5, 100.0))
+    torch.testing.assert_close(unbounded[0], nears.where(nears < NOWHERE, 0.5))
+    assert (unbounded[1] == 100.0).all()
+
 
 def test_no_ray_loses_what_was_seen():
     """Rays from within and without, in a large picture of which few are looked at: a point in the middle of a voxel
