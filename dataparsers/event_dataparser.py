@@ -104,7 +104,9 @@ class EventDataParserConfig(DataParserConfig):
 
 @dataclass
 class EventDataParser(DataParser):
-    """Converts a recording to cameras in a box of size 2 around the origin, with z up, and pictures for any method."""
+    """Converts a recording to cameras in a box around the origin, with z up, and pictures for any method.
+
+    The box has size 2; with a depth of contraction, its part up to that depth has."""
 
     config: EventDataParserConfig
 

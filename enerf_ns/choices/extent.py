@@ -113,7 +113,9 @@ def contraction(scene: Scene) -> None:
     why = f"{100 * share:.1f} % of the events come from beyond {far:.3g} m"
     if end < far:
         why = f"the farthest depth is {far / near:.3g} times the nearest, and {why}"
-    why = scene.why(name, "the box is set" if is_set else why)
+    depth_name = f"{DATAPARSER}.contraction_depth"
+    why = "the box is set" if is_set else why
+    why = scene.why(name if scene.given(depth_name) is None else depth_name, why)
     scene.row("contraction", kept, f"space beyond a depth of {end:.3g} m" * kept, why, name)
 
 

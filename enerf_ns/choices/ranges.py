@@ -158,6 +158,9 @@ def _check_order(config: TrainerConfig) -> None:
         raise FlagError(
             f"event-data --box is {_shown(parser.box)}, but half its side must be at least {DEPTH_LIMITS[0]:g} m."
         )
+    if parser.contraction_depth is not None and (parser.box is not None or model.contraction is False):
+        other = "event-data --box" if parser.box is not None else "--pipeline.model.contraction False"
+        raise FlagError(f"event-data --contraction-depth contradicts {other}; leave one of both out.")
     if model.max_res is not None and model.max_res < model.base_res:
         raise FlagError(
             f"--pipeline.model.max-res is {model.max_res}, but must be at least --pipeline.model.base-res, which is "

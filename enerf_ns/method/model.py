@@ -169,9 +169,9 @@ class EnerfModelConfig(ModelConfig):
     """Learn a scene at infinity, whose brightness depends on the direction alone: a thin shell far outside the box.
     Default: True where the camera only turns, unless a depth range is set."""
     contraction: Optional[bool] = None  # noqa: UP045
-    """Contract the space beyond the box, out to infinity, as mip-NeRF 360 does. Without contraction the space beyond
-    the box is empty. Default: True where a share of the events comes from beyond the box, or where the farthest depth
-    is more than four times the nearest."""
+    """Contract space from the data parser's depth of contraction on, out to infinity, as mip-NeRF 360 does. Without
+    contraction the space beyond the box is empty. Default: True where a share of the events comes from beyond the box,
+    or where the farthest depth is more than four times the nearest."""
     near_plane: Optional[float] = None  # noqa: UP045
     """Nearest distance of a sample from the camera, in scene units. Default: the near end of the recording's depths."""
 

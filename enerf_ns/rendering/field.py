@@ -79,11 +79,12 @@ class HashDensity(nn.Module):
     Args:
         aabb: Box in scene units, shape (2, 3). Without contraction, density outside the box is zero.
         num_levels: Levels of the hash grid.
-        min_res, max_res: Lattice cells along a side of the box, at the coarsest and at the finest level.
+        min_res, max_res: Lattice cells along a side of the box, or with contraction along a side of [-1, 1], at the
+            coarsest and at the finest level.
         log2_table_size: Each level has 2**log2_table_size rows.
         hidden_dim: Width of the hidden layer.
-        contraction: Whether space beyond the box, up to infinity, is contracted (mip-NeRF 360, Barron et al., CVPR
-            2022). The box lies within [-1, 1].
+        contraction: Whether space beyond [-1, 1], up to infinity, is contracted (mip-NeRF 360, Barron et al., CVPR
+            2022).
         num_features: Number of features.
         init_density: Density before training, in 1 / scene unit.
         backend: Backend of the hash grid; see `enerf_ns.kernels.hash_grid.backend_of`.

@@ -228,6 +228,11 @@ def test_flags_of_messages_are_those_of_ns_train():
         ),
         ("parser", {"box": (0.0, 0.0, 0.0, 0.0)}, r"^event-data --box is 0 0 0 0, but half its side must be at least"),
         (
+            "parser",
+            {"box": (0.0, 0.0, 0.0, 1.0), "contraction_depth": 2.0},
+            r"^event-data --contraction-depth contradicts event-data --box; leave one of both out\.$",
+        ),
+        (
             "model",
             {"base_res": 65, "max_res": 64},
             r"^--pipeline\.model\.max-res is 64, but .*base-res, which is 65\.$",
@@ -256,6 +261,15 @@ def test_numbers_that_do_not_fit_one_another_are_refused(part: str, changes: dic
     for name, value in changes.items():
         object.__setattr__(parts[part], name, value)
     with pytest.raises(FlagError, match=message):
+        check_ranges(config)
+
+
+def test_a_depth_of_contraction_without_contraction_is_refused():
+    config = typing.cast(EnerfTrainerConfig, copy.deepcopy(METHODS["enerf"]))
+    config.pipeline.datamanager.dataparser.contraction_depth = 2.0
+    check_ranges(config)
+    config.pipeline.model.contraction = False
+    with pytest.raises(FlagError, match=r"^event-data --contraction-depth contradicts --pipeline\.model\.contraction"):
         check_ranges(config)
 
 

@@ -600,6 +600,8 @@ def test_a_large_range_of_depths_decides_on_contraction(recording: Path, far: fl
     row = rows(resolution)["contraction"]
     assert row.kept == (end is not None)
     assert row.value == ("" if end is None else f"space beyond a depth of {end:.3g} m")
+    is_flag = bool(settings) and "datamanager.dataparser.box" not in settings
+    assert (row.why == "set by flag") == is_flag
     near_plane = resolution.values["model.near_plane"]
     _, scale, box = scene_normalisation(made, 1.0, far, config.datamanager.dataparser.box, end)
     assert near_plane == pytest.approx(scale)
