@@ -102,7 +102,7 @@ MAX_EXTENT = 100.0
 """Largest extent of the camera's path, metres. A hand-held path that is read in millimetres spans hundreds."""
 
 MAX_DEPTH_RATIO = 100.0
-"""Largest ratio between farthest and nearest depth. Samples along rays are spread over the whole range."""
+"""Largest ratio between farthest and nearest depth. Cells and samples of a field are spread over the whole range."""
 
 
 @dataclass(frozen=True)
@@ -360,7 +360,7 @@ def _distance_problems(
     if depth_range and depth_range[1] > MAX_DEPTH_RATIO * depth_range[0]:
         yield Problem(
             f"The scene reaches from {depth_range[0]:.3g} m to {depth_range[1]:.3g} m.",
-            "Samples along rays are sparse over such a range: state a narrower one with --depth-range NEAR FAR of the "
+            "So large a range costs detail: if it is too wide, state a narrower one with --depth-range NEAR FAR of the "
             "data parser (metres).",
         )
 
