@@ -2,7 +2,7 @@
 
 `ns-train` belongs to Nerfstudio, and tyro prints its help and its errors. `speak_for_methods` replaces both for the
 methods of this package, and leaves them as they are for all others and for a tyro that has them elsewhere. The help of
-`enerf` is tyro's own, with `join_lines_of_help`.
+`enerf` is tyro's own, with `shorten_help`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache, wraps
 from itertools import takewhile
@@ -129,15 +130,16 @@ def speak_for_methods(config: type, names: Sequence[str]) -> None:
 
 
 @cache
-def join_lines_of_help() -> None:
-    """Makes tyro join the lines of the docstring of a flag, so that help is as wide as the terminal.
+def shorten_help() -> None:
+    """Makes tyro join the lines of the docstring of a flag, and leave out a default that is None or empty.
 
-    tyro 1.0.17 joins lines that begin with a letter, before it takes away the indent of the lines after the first.
+    tyro 1.0.17 joins lines that begin with a letter, before it takes away the indent of the lines after the first. What
+    such a default means is said by the docstring.
     """
     try:
-        from tyro import _docstrings as tyros
+        from tyro import _arguments, _docstrings
 
-        read = tyros.parse_docstring_from_object
+        read, describe = _docstrings.parse_docstring_from_object, _arguments.generate_argument_helptext
     except (ImportError, AttributeError):
         return
 
@@ -145,7 +147,21 @@ def join_lines_of_help() -> None:
     def joined(of: object) -> dict[str, str]:
         return {name: " ".join(text.split()) for name, text in read(of).items()}
 
-    tyros.parse_docstring_from_object = joined
+    @wraps(describe)
+    def described(argument: Any, *args: Any, **options: Any) -> Any:
+        text = describe(argument, *args, **options)
+        return _tried(lambda: _without_default(describe, text, argument, *args, **options)) or text
+
+    _docstrings.parse_docstring_from_object = joined
+    _arguments.generate_argument_helptext = described
+
+
+def _without_default(describe: Callable[..., Any], text: Any, argument: Any, *args: Any, **options: Any) -> Any:
+    """The text about a flag without its default, where that is None or empty; else None."""
+    if text.as_str_no_ansi().endswith(("(default: None)", "(default: )")):
+        silent = replace(argument.field.argconf, help_behavior_hint="")
+        return describe(replace(argument, field=replace(argument.field, argconf=silent)), *args, **options)
+    return None
 
 
 def _tried(make: Callable[[], Any]) -> Any:

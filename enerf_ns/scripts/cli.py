@@ -15,7 +15,7 @@ from typing import Any
 
 from enerf_ns import __version__
 from enerf_ns.dataparsers.recording.errors import exit_with_a_sentence, printable
-from enerf_ns.flags import about_unknown, close, join_lines_of_help, spelt
+from enerf_ns.flags import about_unknown, close, shorten_help, spelt
 from enerf_ns.quiet import silence_known_warnings
 
 COMMANDS = {
@@ -111,7 +111,7 @@ def _parsed(command: type, name: str, arguments: list[str]) -> Any:
     """
     import tyro  # here, since SIGINT ends an import with a traceback
 
-    join_lines_of_help()
+    shorten_help()
     said = io.StringIO()
     try:
         with redirect_stderr(said):

@@ -34,8 +34,10 @@ def format_flags() -> type[FormatFlags]:
         hints, about = get_type_hints(format.options), _docstrings(format.options)
         for option in fields(format.options):
             types[option.name] = Optional[hints[option.name]] | types.get(option.name)  # noqa: UP045
-            sentence = f"For a recording of {format.name}: {about.get(option.name, '')} Default: {option.default}."
-            helps.setdefault(option.name, []).append(sentence)
+            text = about.get(option.name, "").replace(" None: ", " Default: ")
+            if option.default is not None:
+                text = f"{text} Default: {option.default}."
+            helps.setdefault(option.name, []).append(f"For a recording of {format.name}: {text}")
     flags = [
         (name, Annotated[types[name], tyro.conf.arg(help=" ".join(sentences))], None)
         for name, sentences in helps.items()

@@ -50,7 +50,7 @@ class Score:
     downscale_factor: Optional[float] = None  # noqa: UP045
     """Factor by which the renders are smaller than the frames. Default: 1."""
     output: Optional[Path] = None  # noqa: UP045
-    """JSON file to write with the scores: their means, and those of each frame. Default: none."""
+    """JSON file to write with the scores: their means, and those of each frame. Default: they are only printed."""
     scoring: Annotated[Scoring, tyro.conf.arg(name="")] = field(default_factory=Scoring)
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
 

@@ -37,6 +37,16 @@ def test_help_breaks_lines_by_the_width_of_the_terminal_alone(command: str, monk
     assert len(lines) > 5 and not [lines[n] for n in range(1, len(lines)) if continued[n - 1] and continued[n]]
 
 
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_tells_a_default_once_and_in_words(command: str, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["enerf", command, "--help"])
+    monkeypatch.setenv("COLUMNS", "2000")
+    with pytest.raises(SystemExit):
+        cli.entrypoint()
+    told = re.findall(r"(?i)default: ?[^.)]*|none: ", capsys.readouterr().out)
+    assert [text for text in told if text.lower() in ("default: none", "default: ", "none: ")] == []
+
+
 @pytest.mark.parametrize("arguments", [[], ["-h"], ["--help"]])
 def test_alone_it_says_what_there_is(arguments: list[str], monkeypatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(sys, "argv", ["enerf", *arguments])

@@ -28,3 +28,4 @@ def test_the_help_says_for_which_format_an_option_is(capsys: pytest.CaptureFixtu
         parsed("--help")
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "For a recording of tum_vie: The event camera that is read" in shown and "Default: left." in shown
+    assert "seconds. Default: 1 ms from view to view" in shown
