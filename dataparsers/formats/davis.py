@@ -24,7 +24,7 @@ from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
-from enerf_ns.dataparsers.recording.files import LONGEST_LINE, check_image_sizes, image_size, of_file, reading
+from enerf_ns.dataparsers.recording.files import LONGEST_LINE, check_image_sizes, files_in, image_size, of_file, reading
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -101,7 +101,7 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
             raise RecordingError(f"{path}, line {number} lists {file}, which lies outside {folder}; copy it there.")
         if not file.is_file():
             raise RecordingError(f"{path}, line {number} lists {file}, which is missing; add it or drop the line.")
-    found = set(files[0].parent.glob(f"*{files[0].suffix}"))
+    found = set(files_in(files[0].parent, f"*{files[0].suffix}"))
     unlisted = len(found.difference(files))
     if unlisted:
         notes.append(f"{unlisted} of {len(found)} images are not listed in images.txt and are not used.")

@@ -42,7 +42,7 @@ from enerf_ns.dataparsers.formats.text_tables import parse_times, read_poses, re
 from enerf_ns.dataparsers.formats.yaml_values import read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes
+from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -239,7 +239,7 @@ def _optional(folder: Path, patterns: tuple[str, ...]) -> Path | None:
     for pattern in patterns:
         if os.path.lexists(folder / pattern):
             return folder / pattern
-        for file in sorted(folder.glob(pattern)):
+        for file in files_in(folder, pattern):
             return file
     return None
 

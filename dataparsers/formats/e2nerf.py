@@ -34,7 +34,7 @@ from enerf_ns.dataparsers.formats.frame_folders import images_in
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, load_array, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -127,13 +127,13 @@ def _shifted(file: EventFile, by: int) -> Iterator[Events]:
 
 def _find_recording(folder: Path) -> Path:
     """Returns the .aedat4 file, or raises RecordingError that says what the folder is instead."""
-    found = sorted(folder.glob("*.aedat4"))
+    found = files_in(folder, "*.aedat4")
     if len(found) > 1:
         names = ", ".join(file.name for file in found[:8])
         raise RecordingError(f"{folder} holds {names}, but one .aedat4 file was expected; leave that of the scene.")
     if found:
         return found[0]
-    if (folder / "transform_train.json").exists() or any(folder.glob("r_*/v2e-dvs-events.txt")):
+    if (folder / "transform_train.json").exists() or files_in(folder, "r_*/v2e-dvs-events.txt"):
         raise RecordingError(
             f"{folder} is a synthetic scene of E2NeRF, whose views were simulated one by one, so that no events lie "
             "between them, but events of a camera that moves through all views were expected; use enerf simulate."

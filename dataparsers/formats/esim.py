@@ -35,7 +35,7 @@ from enerf_ns.dataparsers.formats.writer import (
 )
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_folder, in_colour, load_array, of_file
+from enerf_ns.dataparsers.recording.files import check_is_folder, files_in, in_colour, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -55,12 +55,12 @@ def read(folder: Path) -> EventRecording:
         RecordingError: A file is missing, empty or cannot be used.
     """
     notes: list[str] = []
-    poses_files = sorted(folder.glob("*poses_all*.txt"))
+    poses_files = files_in(folder, "*poses_all*.txt")
     if not poses_files:
         raise RecordingError(
             f"{folder} holds no *poses_all*.txt; a file of poses (t_ns px py pz qx qy qz qw) was expected."
         )
-    event_files = sorted((folder / "events").glob("*.npy"))
+    event_files = files_in(folder / "events", "*.npy")
     if not event_files:
         raise RecordingError(f"{folder / 'events'} holds no .npy files; files of events (x y t_ns p) were expected.")
     _check_numbers(event_files)
@@ -139,7 +139,7 @@ def _read_frames(
     folder: Path, camera: Camera, trajectory: Trajectory, poses_file: Path, exposure: int | None
 ) -> Frames | None:
     check_is_folder(folder.parent / "depth", "a folder of depth maps")
-    depth_files = sorted((folder.parent / "depth").glob("*.npy"))
+    depth_files = files_in(folder.parent / "depth", "*.npy")
     stamps_file = folder / "image_stamps_ns.txt"
     return read_frames(
         images_in(folder), stamps_file, camera, trajectory, depth_files, exposure=exposure, poses_file=poses_file

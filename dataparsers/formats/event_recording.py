@@ -54,13 +54,7 @@ from enerf_ns.dataparsers.formats.writer import (
 )
 from enerf_ns.dataparsers.recording.camera import COEFFICIENTS, Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import (
-    check_is_folder,
-    is_deep,
-    load_array,
-    of_file,
-    write_whole,
-)
+from enerf_ns.dataparsers.recording.files import check_is_folder, files_in, is_deep, load_array, of_file, write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of, is_deep_picture, load_depth_map, load_picture
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, LARGEST_GAMMA, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -107,7 +101,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
         notes.append(f"The blurred frames are reconstructed from events by {reconstructed_by}.")
     stored = _parse_white_level(about), _parse_gamma(about)
     check_is_folder(folder / "depth", "a folder of depth maps")
-    depth_files = sorted((folder / "depth").glob("[!.]*.npy"))
+    depth_files = files_in(folder / "depth", "*.npy")
     with of_file(path):
         return EventRecording(
             path=folder,
@@ -404,7 +398,7 @@ def _read_frames(
 
 def _images_in(folder: Path) -> list[Path]:
     kinds = Image.registered_extensions()
-    return sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in kinds)
+    return [file for file in files_in(folder, "*") if file.suffix.lower() in kinds]
 
 
 def _frame_times(folder: Path) -> dict[str, int]:

@@ -61,6 +61,7 @@ from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import (
     check_image_sizes,
     check_is_folder,
+    files_in,
     image_size,
     load_image,
     of_file,
@@ -186,7 +187,7 @@ def read(
 
 
 def _split(folder: Path, stated: str | None) -> str:
-    found = sorted(path.parent.name for path in folder.glob("*/events") if path.is_dir())
+    found = [path.parent.name for path in files_in(folder, "*/events") if path.is_dir()]
     if stated is not None:
         if stated not in found:
             raise FlagError(
@@ -207,7 +208,7 @@ def _split(folder: Path, stated: str | None) -> str:
 def _pose_folder(views: Path, pose_set: str | None) -> Path:
     if pose_set is None:
         return views / "pose"
-    known = [path.name.removeprefix("pose_") for path in sorted(views.glob("pose_*")) if path.is_dir()]
+    known = [path.name.removeprefix("pose_") for path in files_in(views, "pose_*") if path.is_dir()]
     if pose_set not in known:
         raise FlagError(
             f"--pose-set {pose_set} asks for pose_{pose_set}, which {views} lacks; "
@@ -219,7 +220,7 @@ def _pose_folder(views: Path, pose_set: str | None) -> Path:
 def _pose_files(folder: Path) -> tuple[list[Path], list[int] | None]:
     """Returns the files of the poses in order of time, and the last number of each name, if all names have one."""
     check_is_folder(folder, "a folder of poses")
-    files = sorted(file for file in folder.glob("*.txt") if not {"usable", "start"} & set(re.split(r"[_.]", file.name)))
+    files = [file for file in files_in(folder, "*.txt") if not {"usable", "start"} & set(re.split(r"[_.]", file.name))]
     if not 2 <= len(files) <= MOST_VIEWS:
         raise RecordingError(f"{folder} holds {len(files):,} poses (.txt), but from 2 to {MOST_VIEWS:,} were expected.")
     last = [re.search(r"(\d{1,18})$", file.stem) for file in files]
@@ -259,7 +260,7 @@ def _read_camera(views: Path, num_views: int, images: Sequence[Path], notes: lis
     folder = views / "intrinsics"
     check_is_folder(folder, "a folder of intrinsics")
     expected = "a matrix of 4 x 4 numbers, with or without k1 k2 0 0,"
-    files = sorted(folder.glob("*.txt"))
+    files = files_in(folder, "*.txt")
     one = folder / "intrinsics.txt"
     is_undistorted = one in files
     if is_undistorted:
@@ -332,7 +333,7 @@ def _pattern_of_mask(path: Path, notes: list[str]) -> str | None:
 
 def _events_file(folder: Path, notes: list[str]) -> Path:
     check_is_folder(folder, "a folder of events")
-    files = sorted(folder.glob("*.npz"))
+    files = files_in(folder, "*.npz")
     undistorted = [file for file in files if "undistort" in file.name]
     chosen = files if len(files) == 1 else undistorted
     if len(chosen) != 1:

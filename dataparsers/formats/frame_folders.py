@@ -11,7 +11,7 @@ from jaxtyping import Int64
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows, read_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, load_array, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, check_is_folder, files_in, load_array, of_file
 from enerf_ns.dataparsers.recording.recording import LONGEST_EXPOSURE, Frames
 from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -24,7 +24,7 @@ def images_in(folder: Path) -> tuple[Path, ...]:
         RecordingError: The place is a file.
     """
     check_is_folder(folder, "a folder of frames")
-    return tuple(sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg")))
+    return tuple(files_in(folder, "*.png") or files_in(folder, "*.jpg"))
 
 
 def read_stamps(files: Sequence[Path], stamps_file: Path, unit: str, folder: Path) -> Int64[np.ndarray, " frames"]:

@@ -56,7 +56,7 @@ from enerf_ns.dataparsers.formats.robust_enerf import checked_trajectory
 from enerf_ns.dataparsers.formats.yaml_values import read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, load_array, of_file, reading
+from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in, image_size, load_array, of_file, reading
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -161,7 +161,7 @@ def _files_of_poses(folder: Path, pose_set: str | None) -> tuple[Path, Path, Pat
         return folder / "all_poses_bounds.npy", plain, None
     path = folder / f"all_{pose_set}_poses_bounds.npy"
     if not re.fullmatch(r"[\w.+-]+", pose_set) or not path.exists():
-        sets = [re.fullmatch(r"all_(.+)_poses_bounds\.npy", file.name) for file in sorted(folder.glob("all_*"))]
+        sets = [re.fullmatch(r"all_(.+)_poses_bounds\.npy", file.name) for file in files_in(folder, "all_*")]
         known = ", ".join(found[1] for found in sets if found)
         raise FlagError(
             f"--pose-set {pose_set} asks for {path.name}, which {folder} lacks; "

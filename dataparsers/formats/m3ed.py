@@ -36,7 +36,7 @@ from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseRows
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
-from enerf_ns.dataparsers.recording.files import of_file, reading
+from enerf_ns.dataparsers.recording.files import files_in, of_file, reading
 from enerf_ns.dataparsers.recording.hdf5_files import dataset_at, member_at, open_hdf5, read_dataset
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -120,7 +120,7 @@ def read(
 
 def _find(folder: Path, suffix: str) -> Path | None:
     """Returns the one file with this end of its name, or None."""
-    found = sorted(folder.glob(f"*{suffix}"))
+    found = files_in(folder, f"*{suffix}")
     if len(found) > 1:
         names = ", ".join(file.name for file in found[:8])
         raise RecordingError(

@@ -49,7 +49,7 @@ from enerf_ns.dataparsers.formats.text_tables import MOST_ROWS
 from enerf_ns.dataparsers.formats.yaml_values import find_calibration, kalibr_camera, read_yaml
 from enerf_ns.dataparsers.recording.camera import ROTATION_TOLERANCE, Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import reading
+from enerf_ns.dataparsers.recording.files import files_in, reading
 from enerf_ns.dataparsers.recording.hdf5_files import dataset_at, member_at, open_hdf5
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -89,7 +89,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         )
     place = data.name.removesuffix("_data.hdf5").rstrip("0123456789")
     calibration = find_calibration(folder, f"*camchain-imucam-{escape(place)}.yaml") or next(
-        folder.glob(FILES[2]), None
+        iter(files_in(folder, FILES[2])), None
     )
     if calibration is None:
         raise RecordingError(
@@ -129,7 +129,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
 
 
 def _find_one(folder: Path, pattern: str) -> Path:
-    found = sorted(folder.glob(pattern))
+    found = files_in(folder, pattern)
     if len(found) != 1:
         names = " and ".join(path.name for path in found[:2]) or "none"
         raise RecordingError(

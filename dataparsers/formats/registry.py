@@ -38,7 +38,7 @@ from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import absolute, name_links_out, of_file
+from enerf_ns.dataparsers.recording.files import absolute, files_in, name_links_out, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
@@ -226,7 +226,7 @@ def _files_found(path: Path) -> dict[Format, int]:
 def _is_there(path: Path, pattern: str) -> bool:
     """Returns whether a folder has a file of a pattern, while other processes may remove folders in it."""
     with suppress(FileNotFoundError):
-        return any(path.glob(pattern))
+        return bool(files_in(path, pattern))
     return path.is_dir() and _is_there(path, pattern)
 
 
@@ -238,7 +238,7 @@ def _find_format(path: Path) -> Format:
     found = _files_found(path)
     best = [format for format, count in found.items() if count == max(found.values())]
     if len(best) > 1 and found[best[0]]:
-        files = {format: {file for pattern in format.files for file in path.glob(pattern)} for format in best}
+        files = {format: set(files_in(path, *format.files)) for format in best}
         named = {format: {path / name for name in format.files if (path / name).exists()} for format in best}
         best = [one for one in best if not any(files[one] <= named[other] for other in best if other is not one)]
     if len(best) == 1:

@@ -42,6 +42,7 @@ from enerf_ns.dataparsers.formats.ros_events import MESSAGE_TYPES, EventMessage,
 from enerf_ns.dataparsers.formats.ros_poses import PoseFlagNames, read_bag
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, shortened
+from enerf_ns.dataparsers.recording.files import files_in
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -151,12 +152,12 @@ def read(
 
 def _find_bag(folder: Path) -> Path:
     """Returns the one bag of a folder: a .bag file, the folder with metadata.yaml, or a .db3 or .mcap file."""
-    found = sorted(folder.glob("*.bag"))
+    found = files_in(folder, "*.bag")
     if (folder / "metadata.yaml").exists():
         found.append(folder)
     else:
-        found += sorted([*folder.glob("*.db3"), *folder.glob("*.mcap")])
-    found += sorted({file.parent for kind in ("db3", "mcap") for file in folder.glob(f"*/*.{kind}")})
+        found += files_in(folder, "*.db3", "*.mcap")
+    found += sorted({file.parent for file in files_in(folder, "*/*.db3", "*/*.mcap")})
     if len(found) != 1:
         names = listed(place.name for place in found)
         raise RecordingError(
@@ -167,7 +168,7 @@ def _find_bag(folder: Path) -> Path:
 
 
 def _files_of(path: Path) -> tuple[Path, ...]:
-    return tuple(sorted([*path.glob("*.db3"), *path.glob("*.mcap")])) if path.is_dir() else (path,)
+    return tuple(files_in(path, "*.db3", "*.mcap")) if path.is_dir() else (path,)
 
 
 def _topics(path: Path) -> dict[str, str]:

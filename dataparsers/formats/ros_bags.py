@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import LARGEST_TEXT, check_is_file, reading
+from enerf_ns.dataparsers.recording.files import LARGEST_TEXT, check_is_file, files_in, reading
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -58,7 +58,7 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
     for name, text in EVENT_TYPES.items():
         store.register(get_types_from_msg(text, name))
     is_folder = path.is_dir()
-    for part in (*path.glob("*.db3"), *path.glob("*.mcap")) if is_folder else ():
+    for part in files_in(path, "*.db3", "*.mcap") if is_folder else ():
         check_is_file(part, "a part of a ROS bag")
     with reading(path / "metadata.yaml" if is_folder else path, "a ROS bag", LARGEST_TEXT if is_folder else None):
         if path.suffix == ".bag":

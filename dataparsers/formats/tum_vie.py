@@ -54,7 +54,7 @@ from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_poses, 
 from enerf_ns.dataparsers.formats.writer import EventFiles, Writer, encode_json, encode_poses, poses_at
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in, image_size, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.time_units import Times, check_units, check_usual_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -146,7 +146,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
     events = Hdf5Events(events_file)
 
     prepared = [folder / "calib_undist.json", folder / f"{event_camera}_images_undistorted"]
-    prepared += folder.glob(f"*rectify_map_{event_camera}.h5")
+    prepared += files_in(folder, f"*rectify_map_{event_camera}.h5")
     is_prepared = any(path.exists() for path in prepared)
     data = folder if is_prepared else _data_folder(folder, sequence)
     images = data / f"{event_camera}_images{'_undistorted' * is_prepared}"
@@ -189,7 +189,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
 
 def _find_one(folder: Path, pattern: str, what: str) -> Path:
     """Returns the only file of a pattern; several files are an error, since none is better than another."""
-    found = sorted(folder.glob(pattern))
+    found = files_in(folder, pattern)
     if not found:
         raise RecordingError(f"{folder} holds no {pattern}; a file of {what} was expected there.")
     if len(found) > 1:
@@ -203,7 +203,7 @@ def _find_one(folder: Path, pattern: str, what: str) -> Path:
 def _data_folder(folder: Path, sequence: str) -> Path:
     """Returns the unpacked archive of frames and poses, or the recording's folder if there is none."""
     named = folder / f"{sequence}-vi_gt_data"
-    found = [named] if named.is_dir() else sorted(path for path in folder.glob("*vi_gt_data") if path.is_dir())
+    found = [named] if named.is_dir() else [path for path in files_in(folder, "*vi_gt_data") if path.is_dir()]
     if len(found) > 1:
         raise RecordingError(
             f"{folder} holds {len(found)} folders *vi_gt_data, but none of them is {named.name}; rename the one that "

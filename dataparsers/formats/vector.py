@@ -39,7 +39,7 @@ from enerf_ns.dataparsers.formats.text_tables import parse_times, read_poses, re
 from enerf_ns.dataparsers.formats.yaml_values import find_calibration, read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_image_sizes, image_size, of_file
+from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in, image_size, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.time_units import Times, check_units
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -82,7 +82,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         RecordingError: A file is missing, empty or cannot be used, or the sequence is a large-scale one.
     """
     suffix = f".synced.{event_camera}_event.hdf5"
-    found = sorted(folder.glob(f"*{suffix}"))
+    found = files_in(folder, f"*{suffix}")
     if len(found) != 1:
         raise RecordingError(
             f"{folder} holds {len(found)} files *{suffix}, but the events of one sequence were expected; give each "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from enerf_ns.dataparsers.formats.json_values import Value
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import LONGEST_LINE, read_text
+from enerf_ns.dataparsers.recording.files import LONGEST_LINE, files_in, read_text
 
 if TYPE_CHECKING:
     import yaml
@@ -23,8 +23,8 @@ KALIBR_MODELS: dict[str, CameraModel] = {"radtan": "radtan", "equidistant": "fis
 
 def find_calibration(folder: Path, pattern: str) -> Path | None:
     """Returns the first file of a pattern in a folder or, without one, in the calibration folders beside it."""
-    places = [folder, *sorted(folder.parent.glob("*[cC]alib*/")), *sorted(folder.parent.glob("*[cC]alib*/*/"))]
-    return next((path for place in places for path in sorted(place.glob(pattern))), None)
+    places = [folder, *files_in(folder.parent, "*[cC]alib*/"), *files_in(folder.parent, "*[cC]alib*/*/")]
+    return next((path for place in places for path in files_in(place, pattern)), None)
 
 
 def read_yaml(path: Path, expected: str) -> tuple[str, Value]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from decimal import Decimal
 from io import FileIO
 from pathlib import Path
 from typing import IO, Any
@@ -138,6 +140,22 @@ def check_is_folder(path: Path, expected: str) -> None:
     """
     if path.exists() and not path.is_dir():
         raise RecordingError(f"{path} is no folder, but {expected} was expected there; rename it, or give its content.")
+
+
+def files_in(folder: Path, *patterns: str) -> list[Path]:
+    """Returns the files and folders of some patterns in a folder, without hidden ones, in the order of their names.
+
+    Hidden are names that begin with a dot, such as the companions ._NAME that macOS writes to disks of other systems.
+    """
+    found = {path for pattern in patterns for path in folder.glob(pattern)}
+    shown = (path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+    return sorted(shown, key=by_numbers)
+
+
+def by_numbers(path: Path) -> list[tuple[Decimal, str]]:
+    """Returns the parts of a name to sort by, so that 2.png comes before 10.png, and 0.25.png before 0.5.png."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", str(path))
+    return [(Decimal(part), part) if number % 2 else (Decimal(-1), part) for number, part in enumerate(parts)]
 
 
 def name_links_out(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,14 @@ from torch import Tensor
 
 from enerf_ns.dataparsers.event_dataparser import OPENGL_FROM_OPENCV
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_folder, image_size, load_array, load_image
+from enerf_ns.dataparsers.recording.files import (
+    by_numbers,
+    check_is_folder,
+    files_in,
+    image_size,
+    load_array,
+    load_image,
+)
 from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.evaluation.views import HeldOutView
@@ -114,7 +120,7 @@ def _thumbnail(picture: Tensor) -> np.ndarray:
 
 def _files(folder: Path, frames: Frames) -> list[Path]:
     check_is_folder(folder, "a folder of renders")
-    renders = [file for file in folder.iterdir() if file.suffix.lower() in (*PICTURES, ARRAY) and file.is_file()]
+    renders = [file for file in files_in(folder, "*") if file.suffix.lower() in (*PICTURES, ARRAY) and file.is_file()]
     if not renders:
         raise RecordingError(f"{folder} holds no renders, but pictures ({', '.join(PICTURES)}) or .npy were expected.")
     names = [source.stem for source in frames.filenames]
@@ -138,12 +144,7 @@ def _files(folder: Path, frames: Frames) -> list[Path]:
             f"{folder} holds {len(renders)} renders that have the name of no held-out frame, but {len(names)} frames "
             f"are held out ({names[0]} and so on); render these, as --views FILE lists them."
         )
-    return sorted(renders, key=_in_order)
-
-
-def _in_order(file: Path) -> list[tuple[int, str]]:
-    """The parts of a name to sort by: 2 comes before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.stem)]
+    return sorted(renders, key=by_numbers)
 
 
 def _render(file: Path, height: int, width: int, white: float) -> Tensor:

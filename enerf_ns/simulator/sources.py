@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.text_tables import read_times
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import check_is_file, image_size, load_image
+from enerf_ns.dataparsers.recording.files import check_is_file, files_in, image_size, load_image
 from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -157,8 +156,7 @@ class ImageFolder(Pictures):
     ):
         if not path.is_dir():
             raise RecordingError(f"{path} is no folder, but one with pictures was expected.")
-        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
-        self.filenames = sorted(files, key=_by_number)
+        self.filenames = files = [file for file in files_in(path, "*") if file.suffix.lower() in PICTURE_SUFFIXES]
         if len(files) < 2:
             found = "only one picture" if files else "no pictures"
             raise RecordingError(f"{path} holds {found} ({' '.join(PICTURE_SUFFIXES)}), but at least two are needed.")
@@ -407,12 +405,6 @@ def _regular_times(path: Path, count: int, rate: float) -> np.ndarray:
             f"{path} has {rate:g} frames per second, which is no frame rate; give it with --frames-per-second."
         )
     return np.round(np.arange(count) * (1e9 / rate)).astype(np.int64)
-
-
-def _by_number(file: Path) -> tuple[list, str]:
-    """Sort key by which picture10 comes after picture9."""
-    parts = re.split(r"([0-9]+)", file.name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], file.name
 
 
 def _camera(camera: Any) -> Camera:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import write_esim
-from test_writer import open_writer, random_events, setup_of, write
+from test_writer import LAYOUTS, open_writer, random_events, setup_of, write
 
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection.problems import find_problems
+from enerf_ns.dataparsers.recording import files
 from enerf_ns.dataparsers.recording.errors import RecordingError
+from enerf_ns.dataparsers.recording.recording import Frames
 
 FOLDERS = [
     *(("esim", name) for name in ("images", "images_corrupted", "depth")),
@@ -98,3 +101,54 @@ def test_a_scene_that_ends_before_the_border_is_no_cut(tmp_path: Path, border: i
     with open_writer("eds", tmp_path, setup) as writer:
         writer.add_events(events)
     assert not [problem for problem in find_problems(read_recording(tmp_path)) if "8 bits" in problem.what]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_companions_of_macos_are_no_files_of_the_recording(tmp_path: Path, layout: str):
+    """macOS writes ._NAME beside each file, on disks of other systems and into archives."""
+    setup = setup_of(layout)
+    for folder in (tmp_path / "plain", tmp_path / "accompanied"):
+        write(layout, folder, setup, random_events(setup.event_camera, 300))
+    for file in [path for path in (tmp_path / "accompanied").rglob("*") if path.is_file()]:
+        (file.parent / f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X        " + bytes(60))
+    plain, accompanied = read_recording(tmp_path / "plain"), read_recording(tmp_path / "accompanied")
+    assert accompanied.notes == plain.notes
+    for kind in ("frames", "blurred_frames"):
+        assert (getattr(plain, kind) is None) == (getattr(accompanied, kind) is None)
+        if getattr(plain, kind):
+            assert names_of(getattr(plain, kind)) == names_of(getattr(accompanied, kind))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_numbers_without_leading_zeros_are_in_order(tmp_path: Path, layout: str):
+    setup = setup_of(layout)
+    for folder in (tmp_path / "padded", tmp_path / "counted"):
+        write(layout, folder, setup, random_events(setup.event_camera, 300))
+    renamed = [path for path in (tmp_path / "counted").rglob("*") if re.search("00[0-9]+$", path.stem)]
+    for file in renamed:
+        file.rename(file.with_stem(re.sub("0+([0-9]+)$", r"\1", file.stem)))
+    assert len(renamed) >= len(setup.frame_times)
+    padded, counted = read_recording(tmp_path / "padded"), read_recording(tmp_path / "counted")
+    frames, of_counted = (one.frames or one.blurred_frames for one in (padded, counted))
+    assert frames is not None and of_counted is not None
+    assert [number_of(file) for file in of_counted.filenames] == [number_of(file) for file in frames.filenames]
+    for depth in (frames.depth_filenames, of_counted.depth_filenames):
+        assert [number_of(file) for file in depth or ()] == [number_of(file) for file in frames.filenames if depth]
+    for column in "xytp":
+        np.testing.assert_array_equal(
+            *(np.concatenate([getattr(events, column) for events in one.stream_events()]) for one in (padded, counted))
+        )
+
+
+def number_of(file: Path) -> int:
+    return int(re.findall("[0-9]+", file.stem)[-1])
+
+
+def names_of(frames: Frames) -> list[str]:
+    return [file.stem for file in frames.filenames]
+
+
+def test_all_readers_look_for_files_in_one_way():
+    """`files_in` leaves hidden files out, and counts in the names."""
+    readers = (Path(files.__file__).parents[1] / "formats").glob("*.py")
+    assert [file.name for file in readers if re.search(r"\.(r?glob|scandir|listdir)\(", file.read_text())] == []

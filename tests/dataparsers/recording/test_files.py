@@ -16,6 +16,7 @@ from recordings import HEIGHT, WIDTH
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import (
+    files_in,
     image_size,
     in_colour,
     load_array,
@@ -265,3 +266,13 @@ def test_what_processes_that_are_gone_have_left_is_removed_by_the_next_that_writ
     (tmp_path / alive).write_text("still being written")
     write_together(tmp_path, {"a/2.png": b"4"})
     assert contents(tmp_path) == {"a/2.png": b"4", alive: b"still being written"}
+
+
+def test_files_are_in_the_order_in_which_people_count(tmp_path: Path):
+    names = ["0.25.png", "0.5.png", "1.png", "a2.png", "a10.png", "a1609459200123456789.png", "b.png"]
+    for name in [*names, "c.txt", "._1.png", ".hidden/1.png", "inner/1.png"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert [file.name for file in files_in(tmp_path, "*.png")] == names
+    assert files_in(tmp_path, "*.txt", "*/*.png") == [tmp_path / "c.txt", tmp_path / "inner/1.png"]
+    assert files_in(tmp_path / "missing", "*") == []
