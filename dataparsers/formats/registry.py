@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -160,6 +160,7 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
         raise RecordingError(f"{path} is a file, but a recording is a folder; give the folder that it lies in.")
     found = _find_format(path) if format == "auto" else format_named(format)
     _check_options(path, found, options)
+    read_with = asdict(found.options(**options))
     if poses is not None:
         if not found.takes_poses:
             whose = ", ".join(format.name for format in formats() if format.takes_poses)
@@ -173,7 +174,7 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
     name_links_out(path)
     try:
         with of_file(path):
-            return found.read(path, **options)
+            return replace(found.read(path, **options), read_with=read_with)
     except OSError as error:  # as of a name that is longer than names can be
         raise RecordingError(
             f"{path} names ...{os.fsdecode(error.filename or path)[-NAME_SHOWN:]}, which cannot be opened "

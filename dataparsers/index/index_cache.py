@@ -23,7 +23,7 @@ from enerf_ns.dataparsers.index.event_survey import EventStream, Survey, sorted_
 from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.files import partial_of
 
-LAYOUT = 3
+LAYOUT = 4
 """Version of an entry's content. It grows when the content changes."""
 
 CACHED_FROM = 2_000_000

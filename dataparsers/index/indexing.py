@@ -53,6 +53,7 @@ def index_events(recording: EventRecording) -> EventIndex:
         raise RecordingError(f"{recording.path} holds no events; give a recording with some.")
     name = entry_name(
         format=recording.format,
+        options=recording.read_with,
         files=recording.event_file_states,
         first=first,
         sensor=[camera.width, camera.height],

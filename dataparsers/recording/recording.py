@@ -258,6 +258,8 @@ class EventRecording:
     times_in: Mapping[str, tuple[Path, str]] = field(default_factory=dict)
     """File and unit (s, us or ns) of the times of "events", "poses", "frames" and "blurred frames", for error messages.
     Default: the folder, ns."""
+    read_with: Mapping[str, object] = field(default_factory=dict)
+    """Options of the format, all of them, since some of them choose other events from the same files."""
     time_range: tuple[int, int] | None = None
     """First and last time (ns) of the selected range; None for the whole recording."""
     keep_hot_pixels: bool = False

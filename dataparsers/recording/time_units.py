@@ -36,6 +36,9 @@ LARGEST_RATE, LARGEST_RATE_OF_PIXEL = 2e9, 5e4
 FEWEST_EVENTS = 1000
 """Fewest events whose rate means anything."""
 
+SHORTEST_CLIP = 500_000_000
+"""Shortest time of events at a usual rate, nanoseconds, that is believed to be a small part of a long log of poses."""
+
 SHORTEST_FRAME_STEP = 1_000_000
 """Shortest time between frames, nanoseconds. Closer frames are in another unit if they also span a small part of the
 poses."""
@@ -136,8 +139,9 @@ def _is_impossible(column: Times, poses: Times) -> bool:
     too_short = LARGEST_SPAN_RATIO * column.span < poses.span
     if column.kind == "frames":
         return too_long or (too_short and column.number > 1 and column.step < SHORTEST_FRAME_STEP)
+    is_clip = column.span >= SHORTEST_CLIP and column.unusualness <= 1 and poses.unusualness <= 1
     too_many = column.number > LARGEST_RATE * column.span * 1e-9 or column.rate > LARGEST_RATE_OF_PIXEL
-    return column.kind == "events" and (too_long or too_short or too_many)
+    return column.kind == "events" and (too_long or (too_short and not is_clip) or too_many)
 
 
 def wrong_units(columns: Sequence[Times]) -> str:

@@ -22,6 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.evimo2 import read
 from enerf_ns.dataparsers.formats.plain_pickle import loads
+from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.index import index_cache
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import RecordingError
 
@@ -143,6 +145,16 @@ def test_the_event_camera_may_be_named(tmp_path: Path):
         read(folder)
     np.testing.assert_array_equal(joined(read(folder, "samsung_mono").stream_events()).p, scene.p == 0)
     np.testing.assert_array_equal(joined(read(folder, "left_camera").stream_events()).p, scene.p == 1)
+
+
+def test_the_stored_index_of_one_camera_is_not_that_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ENERF_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(index_cache, "CACHED_FROM", 1)
+    scene = make_scene()
+    folder = write_evimo2(tmp_path / "scene", scene)
+    of_one = [index_events(read_recording(folder, event_camera=name)) for name in ("left_camera", "samsung_mono")]
+    assert len(of_one[0]) == len(of_one[1]) and len(list((tmp_path / "cache").iterdir())) == 2
+    assert of_one[0].num_positive + of_one[1].num_positive == len(of_one[0]) != 2 * of_one[0].num_positive
 
 
 @pytest.mark.parametrize("model", ["radtan", "radtan with k3", "equidistant"])

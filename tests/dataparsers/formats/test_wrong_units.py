@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
@@ -22,7 +23,7 @@ from enerf_ns.dataparsers.formats.registry import _read_folder
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.problems import find_problems
 from enerf_ns.dataparsers.recording.errors import RecordingError
-from enerf_ns.dataparsers.recording.time_units import NAMES, NANOSECONDS
+from enerf_ns.dataparsers.recording.time_units import NAMES, NANOSECONDS, Times, check_units
 
 Edit = Callable[[Path, Callable], None]
 """Writes a function of the times, or of the rows x y, into a file."""
@@ -247,3 +248,12 @@ def test_another_unit_is_named(layout: str, kinds: tuple[str, ...], unit: str, w
     said = said_of(folder, tmp_path)
     assert f"look like {NAMES[unit]}" in said, said
     assert str(folder) in said or len(kinds) > 1
+
+
+@pytest.mark.parametrize(("seconds", "is_right"), [(1.2, True), (0.6, True), (0.0012, False)])
+def test_a_clip_within_a_long_log_of_poses_is_no_wrong_unit(tmp_path: Path, seconds: float, is_right: bool):
+    """Of a log of eight minutes. A clip of a millisecond is 1.2 s in another unit."""
+    poses = Times.of_rows("poses", tmp_path, "s", np.arange(48_000) * 10**7)
+    events = Times.of_events(tmp_path, "us", 200_000, round(seconds * 1e9), 640 * 480)
+    with nullcontext() if is_right else pytest.raises(RecordingError, match="does not fit together"):
+        check_units(tmp_path, [events, poses])
