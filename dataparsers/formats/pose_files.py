@@ -4,7 +4,8 @@
     euroc       CSV, t px py pz qw qx qy qz ..., times in ns (EuRoC MAV); names of the columns may state another order
     colmap      folder of a sparse model: images.bin or images.txt, world to camera, one image each, without times
     nerfstudio  transforms.json: matrices, camera to world in OpenGL's axes, one image each, without times
-    bag         ROS 1 (.bag) or ROS 2 (folder): PoseStamped, PoseWithCovarianceStamped, Odometry, Path, tf
+    bag         ROS 1 (.bag) or ROS 2 (folder): PoseStamped, PoseWithCovarianceStamped, TransformStamped,
+                Odometry, Path, tf
 
 To add a format, write a function that reads it, and name it in `POSE_FORMATS`.
 

@@ -2,7 +2,7 @@
 
     *.bag, or metadata.yaml with *.db3 or *.mcap    one bag, in the folder or in a folder within it, with the topics
         events          dvs_msgs/EventArray, prophesee_event_msgs/EventArray or event_camera_msgs/EventPacket
-        frames          sensor_msgs/Image (optional)
+        frames          sensor_msgs/Image or, without them, sensor_msgs/CompressedImage (optional)
         calibration     sensor_msgs/CameraInfo (optional)
         poses           geometry_msgs/PoseStamped, nav_msgs/Odometry and others, or tf (see `ros_poses`): the event
                         camera's, camera to world, OpenCV axes, metres
@@ -22,6 +22,7 @@ The frames are written to the cache once. The reader reads the bag for poses; ev
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -48,7 +49,8 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("*.bag", "*.db3", "*.mcap", "*/*.db3", "*/*.mcap", "metadata.yaml")
 
-IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 POSE_FLAGS = PoseFlagNames("--bag-poses", "--bag-tf", ", or give poses as --poses of enerf convert")
 
@@ -193,7 +195,12 @@ def _chosen(path: Path, topics: dict[str, str], kinds: tuple[str, ...], what: st
 
 
 def _namespace(topic: str) -> str:
-    return topic.rpartition("/")[0]
+    return _uncompressed(topic).rpartition("/")[0]
+
+
+def _uncompressed(topic: str) -> str:
+    """Returns the topic of the images that a topic has compressed."""
+    return topic.removesuffix("/compressed")
 
 
 def _event_messages(path: Path, topic: str) -> Iterator[EventMessage]:
@@ -287,10 +294,12 @@ def _choose_frames(
     path: Path, topics: dict[str, str], events_topic: str, chosen: str | None, notes: list[str]
 ) -> str | None:
     """Returns the topic of the frames: the chosen one, the only one, or the only one beside the events."""
-    able = [topic for topic, kind in topics.items() if kind == IMAGE]
+    whole = [topic for topic, kind in topics.items() if kind == IMAGE]
+    compressed = [topic for topic, kind in topics.items() if kind == COMPRESSED and "Depth" not in topic]
+    able = [*whole, *(topic for topic in compressed if _uncompressed(topic) not in whole)]
     beside = [topic for topic in able if _namespace(topic) == _namespace(events_topic)]
     if chosen is not None:
-        return _chosen(path, topics, (IMAGE,), "frames", chosen)
+        return _chosen(path, topics, (IMAGE, COMPRESSED), "frames", chosen)
     if len(able) > 1 and len(beside) != 1:
         notes.append(
             f"No frames are used, since {path.name} holds several topics of them; give --bag-frames as one of "
@@ -325,14 +334,14 @@ def _images(path: Path, topic: str, size: tuple[int, int] | None = None) -> Iter
     """Yields stamps (ns) and pixels, [height, width, 1 or 3], uint8 or uint16, of the frames on a topic."""
     with open_bag(path) as bag:
         connections = [connection for connection in bag.connections if connection.topic == topic]
-        for _, data in messages_on(bag, connections):
-            message: Any = bag.deserialize(data, IMAGE)
+        for connection, data in messages_on(bag, connections):
+            message: Any = bag.deserialize(data, connection.msgtype)
             where = f"{path} holds an image on {topic}"
-            if size not in (None, (message.width, message.height)):
-                raise RecordingError(
-                    f"{where} of {message.width} x {message.height} pixels after others of {size}; give one camera."
-                )
-            yield message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, _pixels(where, message)
+            pixels = _pixels(where, message) if connection.msgtype == IMAGE else _decompressed(where, message)
+            height, width = pixels.shape[:2]
+            if size not in (None, (width, height)):
+                raise RecordingError(f"{where} of {width} x {height} pixels after others of {size}; give one camera.")
+            yield message.header.stamp.sec * 10**9 + message.header.stamp.nanosec, pixels
 
 
 def _pixels(where: str, message: Any) -> np.ndarray:
@@ -353,6 +362,21 @@ def _pixels(where: str, message: Any) -> np.ndarray:
     pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
     pixels = pixels.reshape(message.height, message.width, channels)
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def _decompressed(where: str, message: Any) -> np.ndarray:
+    """Returns the pixels of a JPEG or PNG, whose encoding the message names before a semicolon."""
+    with suppress(cv2.error):
+        pixels = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is not None and pixels.dtype in (np.uint8, np.uint16):
+            if pixels.ndim == 3:
+                return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+            conversion = ENCODINGS.get(str(message.format).partition(";")[0].strip(), (None, 1, None))[2]
+            return pixels[..., None] if conversion is None else cv2.cvtColor(pixels, conversion)
+    raise RecordingError(
+        f"{where} in the format {shortened(str(message.format))!r}, which is no picture in JPEG or PNG; republish it "
+        "as sensor_msgs/Image."
+    )
 
 
 FORMAT = Format(

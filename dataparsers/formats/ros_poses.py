@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,16 @@ from enerf_ns.dataparsers.formats.ros_bags import messages_on, open_bag
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
+PATH = "nav_msgs/msg/Path"
+
 POSE_TYPES: dict[str, Callable[[Any], list[tuple[Any, Any]]]] = {
     "geometry_msgs/msg/PoseStamped": lambda message: [(message.header.stamp, message.pose)],
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: [(message.header.stamp, message.pose.pose)],
+    "geometry_msgs/msg/TransformStamped": lambda message: [(message.header.stamp, message.transform)],
     "nav_msgs/msg/Odometry": lambda message: [(message.header.stamp, message.pose.pose)],
-    "nav_msgs/msg/Path": lambda message: [(pose.header.stamp, pose.pose) for pose in message.poses],
+    PATH: lambda message: [(pose.header.stamp, pose.pose) for pose in message.poses],
 }
-"""Stamps and poses of a message, by the type of the message."""
+"""Stamps and poses, or transformations, of a message, by the type of the message."""
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
@@ -66,18 +70,24 @@ def read_bag(
         if topic is not None:
             raise FlagError(f"{flags.topic} and {flags.frames} were both given, but one is enough; leave one out.")
         return _between_frames(path, *frames, notes, flags)
-    found = [
-        _row(stamp, pose.position, pose.orientation)
-        for kind, message in _messages(path, POSE_TYPES, topic, flags)
-        for stamp, pose in POSE_TYPES[kind](message)
-    ]
-    return _in_order(path, found, notes)
+    found: list[tuple[int, list[float]]] = []
+    of_paths: dict[int, list[float]] = {}
+    for kind, message in _messages(path, POSE_TYPES, topic, flags):
+        rows = (_row(stamp, pose) for stamp, pose in POSE_TYPES[kind](message))
+        if kind == PATH:  # each path repeats the poses of the one before, corrected by what was seen since
+            of_paths.update(rows)
+        else:
+            found.extend(rows)
+    return _in_order(path, [*found, *of_paths.items()], notes)
 
 
 def _messages(
     path: Path, kinds: Collection[str], topic: str | None = None, flags: PoseFlagNames = PoseFlagNames()
 ) -> Iterator[tuple[str, Any]]:
-    """Yields type and content of the messages of these types: on one topic, or of tf on all topics."""
+    """Yields type and content of the messages of these types: on one topic, or of tf on all topics.
+
+    A path is left out if a longer one follows, which holds its poses too.
+    """
     with open_bag(path) as bag:
         able = [connection for connection in bag.connections if connection.msgtype in kinds]
         if kinds is POSE_TYPES:
@@ -89,8 +99,9 @@ def _messages(
                 )
                 raise FlagError(f"{path} holds {what}; {choice}.")
             able = [connection for connection in able if connection.topic == (topic or topics[0])]
-        for connection, data in messages_on(bag, able):
-            yield connection.msgtype, bag.deserialize(data, connection.msgtype)
+        for (connection, data), (_, following) in pairwise(chain(messages_on(bag, able), [(None, b"")])):
+            if connection.msgtype != PATH or len(following) <= len(data):
+                yield connection.msgtype, bag.deserialize(data, connection.msgtype)
 
 
 def _of_tf(connections: Collection[Any], flags: PoseFlagNames) -> str:
@@ -99,8 +110,11 @@ def _of_tf(connections: Collection[Any], flags: PoseFlagNames) -> str:
     return f"record one of {in_words([*POSE_TYPES])}, or tf{flags.otherwise}"
 
 
-def _row(stamp: Any, position: Any, turn: Any) -> tuple[int, list[float]]:
+def _row(stamp: Any, pose: Any) -> tuple[int, list[float]]:
+    """Returns time (ns), position and quaternion of a pose or a transformation of ROS."""
     time = stamp.sec * 10**9 + stamp.nanosec
+    is_pose = hasattr(pose, "position")
+    position, turn = (pose.position, pose.orientation) if is_pose else (pose.translation, pose.rotation)
     return time, [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
 
 
@@ -128,8 +142,7 @@ def _between_frames(path: Path, world: str, camera: str, notes: list[str], flags
         for one in message.transforms:
             child = one.child_frame_id.strip("/")
             parents[child] = one.header.frame_id.strip("/")
-            moved = one.transform
-            found.setdefault(child, []).append(_row(one.header.stamp, moved.translation, moved.rotation))
+            found.setdefault(child, []).append(_row(one.header.stamp, one.transform))
     if not parents:
         raise RecordingError(
             f"{path} holds no tf, but {flags.frames} names two of its frames; record /tf, or leave it out."

@@ -209,8 +209,14 @@ def test_a_hand_eye_transform(tmp_path: Path, kind: str):
 
 
 def message_of(store: Any, kind: str, time: int, matrix: np.ndarray, is_ros1: bool) -> Any:
-    """A message of a pose, as the definitions of ROS describe it."""
+    """A message of a pose, as the definitions of ROS describe it; or a path of several poses at the first of TIMES."""
     types = SimpleNamespace(**{name.split("/")[-1]: kind for name, kind in store.types.items()})
+    if matrix.ndim == 3:
+        path = [
+            message_of(store, "geometry_msgs/msg/PoseStamped", *pose, is_ros1)
+            for pose in zip(TIMES[: len(matrix)].tolist(), matrix, strict=True)
+        ]
+        return types.Path(path[-1].header, path)
     stamp = store.types["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9)
     header = types.Header(**({"seq": 0} if is_ros1 else {}), stamp=stamp, frame_id="world")
     px, py, pz, qx, qy, qz, qw = rows_of(matrix[None])[0].tolist()
@@ -227,6 +233,8 @@ def message_of(store: Any, kind: str, time: int, matrix: np.ndarray, is_ros1: bo
     if kind == "nav_msgs/msg/Path":
         return types.Path(header, [types.PoseStamped(header, pose)])
     moved = types.Transform(types.Vector3(px, py, pz), types.Quaternion(qx, qy, qz, qw))
+    if kind == "geometry_msgs/msg/TransformStamped":
+        return types.TransformStamped(header, "body", moved)
     return types.TFMessage([types.TransformStamped(header, "body", moved)])
 
 
@@ -264,16 +272,27 @@ def poses_on(
     return [(topic, kind, time, matrix, frames) for time, matrix in zip(times.tolist(), matrices, strict=True)]
 
 
-KINDS = ["PoseStamped", "PoseWithCovarianceStamped", "Odometry", "Path"]
+GEOMETRY = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+KINDS = [*(f"geometry_msgs/msg/{kind}" for kind in GEOMETRY), "nav_msgs/msg/Odometry", "nav_msgs/msg/Path"]
 
 
 @pytest.mark.parametrize("name", ["recording.bag", "recording"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_bags_of_poses(tmp_path: Path, name: str, kind: str):
-    kind = f"{'geometry_msgs' if kind.startswith('Pose') else 'nav_msgs'}/msg/{kind}"
     bag = write_bag(tmp_path / name, poses_on("/pose", kind))
     same(read(bag))
     same(read(bag, poses_topic="/pose"))
+
+
+def test_the_poses_of_paths_are_those_of_the_latest(tmp_path: Path):
+    """Odometry publishes its whole path anew with each pose, and corrects it. The last path lacks one."""
+    drifted = MATRICES.copy()
+    drifted[:, 0, 3] += 0.5
+    paths = [drifted[:count] for count in range(1, len(TIMES))] + [MATRICES, MATRICES[:-1]]
+    messages = [("/path", "nav_msgs/msg/Path", int(TIMES[0]) + i, path, {}) for i, path in enumerate(paths)]
+    found = read(write_bag(tmp_path / "r.bag", messages))
+    same(found)
+    assert found[2] == []
 
 
 def test_one_topic_of_several_is_chosen(tmp_path: Path):

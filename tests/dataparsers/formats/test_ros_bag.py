@@ -9,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from recordings import FRAME_TIMES, HEIGHT, POSE_TIMES, TRUE_EVENTS, WIDTH, image, joined, poses
 from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
@@ -68,6 +70,8 @@ class Bag:
     """Of a message's stamp after its first event, ns, in turn."""
     images: str = "mono8"
     frames: tuple[str, ...] = ("/dvs/image_raw",)
+    compressed: tuple[str, ...] = ()
+    """Topics of frames as PNG."""
     infos: tuple[tuple[str, int, int], ...] = (("/dvs/camera_info", WIDTH, HEIGHT),)
     events_topics: tuple[str, ...] = ("/dvs/events",)
     poses_topics: tuple[str, ...] = ("/pose",)
@@ -139,6 +143,13 @@ def write_bag(folder: Path, bag: Bag = Bag()) -> Path:
                 step=step,
                 data=data,
             )
+            messages.append((topic, time, picture))
+    for topic in bag.compressed:
+        for i, time in enumerate((FRAME_TIMES + EPOCH).tolist()):
+            data, format = BytesIO(), f"{bag.images}; png compressed {bag.images.replace('rgb', 'bgr')}"
+            Image.fromarray(true_image(bag.images, i).squeeze()).save(data, "PNG")
+            pixels = np.frombuffer(data.getvalue(), np.uint8)
+            picture = new("sensor_msgs/msg/CompressedImage", header=header(time), format=format, data=pixels)
             messages.append((topic, time, picture))
     for topic in bag.poses_topics:
         for time, row in zip((POSE_TIMES + EPOCH).tolist(), poses().tolist(), strict=True):
@@ -678,3 +689,36 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path: Path, monkeypa
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(RecordingError, match=r"pip install 'enerf-ns\[bag\]'\."):
         ros_bag.read(folder)
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+@pytest.mark.parametrize("images", ["mono8", "rgb8", "mono16"])
+def test_compressed_frames_are_read_where_there_are_no_others(tmp_path: Path, images: str, ros: int):
+    bag = Bag(ros=ros, images=images, frames=(), compressed=("/dvs/image_raw/compressed",))
+    recording = check_is_truth(write_bag(tmp_path / "compressed", bag), bag)
+    assert [load_image(file).tolist() for file in recording.frames.filenames] == [
+        true_image(images, i).tolist() for i in range(len(FRAME_TIMES))
+    ]
+    both = replace(bag, frames=("/dvs/image_raw",))
+    assert check_is_truth(write_bag(tmp_path / "both", both), both).notes == ()
+
+
+def test_a_mosaic_of_bayer_in_png_is_in_colour(tmp_path: Path):
+    bag = Bag(images="bayer_rggb8", frames=(), compressed=("/dvs/image_raw/compressed",))
+    mosaic = np.tile(np.array([[200, 100], [100, 50]], np.uint8), (HEIGHT // 2, WIDTH // 2))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys.modules[__name__], "true_image", lambda *_: mosaic)
+        folder = write_bag(tmp_path / "bag", bag)
+    frames = read_recording(folder).frames
+    assert frames is not None
+    np.testing.assert_array_equal(load_image(frames.filenames[0])[4, 4], [200, 100, 50])
+
+
+def test_what_is_no_compressed_picture_is_one_sentence(tmp_path: Path):
+    bag = Bag(frames=(), compressed=("/dvs/image_raw/compressed",))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Image.Image, "save", lambda image, file, kind: file.write(b"RVL"))
+        folder = write_bag(tmp_path / "bag", bag)
+    with pytest.raises(RecordingError, match="which is no picture in JPEG or PNG; republish it") as error:
+        read_recording(folder)
+    assert is_one_sentence(str(error.value))
