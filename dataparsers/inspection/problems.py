@@ -209,12 +209,13 @@ def find_problems(
     statistics = statistics or event_statistics(recording, SAMPLED_EVENTS)
     depth_range = depth_range or recording.depth_range
     gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
+    swings = pose_swings(recording, statistics, depth_range, jumps)
     silences, bursts = unusual_rates(recording, statistics, depth_range)
-    flag = _time_range_without(np.concatenate([gaps, jumps, silences, bursts]), statistics)
+    flag = _time_range_without(np.concatenate([gaps, jumps, swings, silences, bursts]), statistics)
     return [
         *_unfinished(recording.path),
         *_left_out({**recording.shares_outside_poses, "events": index_events(recording).share_outside_poses}),
-        *_pose_problems(recording, statistics, gaps, jumps, flag),
+        *_pose_problems(recording, statistics, gaps, jumps, swings, flag),
         *_distance_problems(recording, statistics, depth_range),
         *_rate_problems(silences, bursts, flag),
         *_count_problems(statistics),
@@ -248,6 +249,39 @@ def pose_jumps(
     jumps = np.flatnonzero((shift > JUMP_RATIO * usual) & (shift > usual + MIN_JUMP))
     jumps = jumps[np.argsort(usual[jumps] - shift[jumps])]
     return np.stack([times[jumps], times[jumps + 1]], axis=1)
+
+
+def pose_swings(
+    recording: EventRecording,
+    statistics: EventStatistics,
+    depth_range: tuple[float, float] | None,
+    jumps: Int64[np.ndarray, "jumps 2"],
+) -> Int64[np.ndarray, "swings 2"]:
+    """Times (ns) of the poses between which the interpolated path swings out, as before and after two poses whose
+    stamps almost coincide, the largest swing first.
+
+    Args:
+        recording: Its poses are searched.
+        statistics: Of its events.
+        depth_range: Nearest and farthest depth, metres, if known.
+        jumps: Those of `pose_jumps`, around which the path swings too.
+    """
+    times = recording.trajectory.times[_poses_used(recording, statistics)]
+    steps = np.stack([times[:-1], times[1:]], axis=1)
+    shift = recording.camera.fx * _swings(recording, steps) / _viewing_distance(recording, statistics, depth_range)
+    usual = median_filter(shift, JUMP_NEIGHBOURHOOD, mode="nearest")
+    near_jumps = np.abs(np.arange(len(steps))[:, None] - np.searchsorted(times, jumps[:, 0])).min(1, initial=9) < 9
+    swings = np.flatnonzero((shift > JUMP_RATIO * usual) & (shift > usual + MIN_JUMP) & ~near_jumps)
+    return steps[swings[np.argsort(-shift[swings])]]
+
+
+def _swings(recording: EventRecording, steps: Int64[np.ndarray, "steps 2"]) -> Float64[np.ndarray, " steps"]:
+    """Distance in metres of the interpolated path from the straight way, halfway from each pose to the next."""
+    begin, end, middle = (
+        recording.trajectory.poses(torch.from_numpy(times)).numpy()[:, :, 3]
+        for times in (steps[:, 0], steps[:, 1], steps.sum(axis=1) // 2)
+    )
+    return np.linalg.norm(middle - (begin + end) / 2, axis=1)
 
 
 def unusual_rates(
@@ -300,7 +334,12 @@ def _left_out(shares_outside_poses: dict[str, float]) -> Iterator[Problem]:
 
 
 def _pose_problems(
-    recording: EventRecording, statistics: EventStatistics, gaps: np.ndarray, jumps: np.ndarray, flag: str
+    recording: EventRecording,
+    statistics: EventStatistics,
+    gaps: np.ndarray,
+    jumps: np.ndarray,
+    swings: np.ndarray,
+    flag: str,
 ) -> Iterator[Problem]:
     times, turns, moves = _pose_steps(recording, statistics)
     usual_interval = f"{np.median(np.diff(times)) * 1e-6:.3g} ms"
@@ -329,6 +368,14 @@ def _pose_problems(
             f"{math.degrees(turns[largest]):.2g} degrees at {jumps[0, 0] * 1e-9:.2f} s.",
             "Remove the wrong poses from their file, so that they are interpolated, or use a part without jumps: "
             f"{flag}.",
+        )
+    if len(swings):
+        before, after = swings[0]
+        yield Problem(
+            f"The path through the poses swings by {_swings(recording, swings[:1])[0]:.3g} m between those at "
+            f"{before * 1e-9:.6f} s and {after * 1e-9:.6f} s, which lie on a straight way.",
+            "Two poses there have almost the same stamp, as if stamps were times of arrival: remove those whose stamp "
+            f"is wrong from their file, or use a part without them: {flag}.",
         )
 
 

@@ -112,6 +112,8 @@ def changed_poses(change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         positions[300] += [0.0, 0.4, 0.0]
     if change == "switched markers":
         positions[250:] += [0.0, 0.0, 0.3]
+    if change == "stamps of arrival":
+        times[300] = times[301] - 20_000
     if change == "turning":
         positions *= 0.001
     if change == "millimetres":
@@ -131,6 +133,9 @@ PROBLEMS = {
     ),
     "too few poses": (dict(poses=changed_poses("rare")), r"turns by up to 4\d degrees from one", "every 200 ms"),
     "wrong pose": (dict(poses=changed_poses("wrong pose")), r"2 jumps; the largest is by 0.4 m and", "0.001 1.495"),
+    "stamps of arrival": (
+        dict(poses=changed_poses("stamps of arrival")), r"swings by 0.184 m between those at 1.495", "0.001 1.495",
+    ),
     "switched markers": (
         dict(poses=changed_poses("switched markers")), r"1 jump; .* by 0.3 m and .* at 1.25 s", "0.001 1.245",
     ),
