@@ -33,6 +33,7 @@ from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.dataparsers.recording.ranges import check_reading
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
@@ -113,6 +114,7 @@ class EventDataParser(DataParser):
     def recording(self) -> EventRecording:
         """The recording of this parser's folder, read once per process."""
         config = self.config
+        check_reading(config, "event-data ")
         time_range = config.time_range and (config.time_range[0], config.time_range[1])  # YAML may give a list
         selection = (
             *(time_range, config.keep_hot_pixels, config.keep_pose_gaps, config.undistort),

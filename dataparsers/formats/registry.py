@@ -39,6 +39,7 @@ from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, files_in, name_links_out, of_file
+from enerf_ns.dataparsers.recording.ranges import RANGES, check_range
 from enerf_ns.dataparsers.recording.recording import EventRecording
 
 _FORMATS: dict[str, Format] = {}
@@ -109,6 +110,8 @@ def read_recording(
         RecordingError: The folder has no known format, or its content cannot be used.
         FlagError: There is no such format, it lacks an option or takes no poses, or the time range cannot be used.
     """
+    if time_range is not None:
+        check_range("--time-range", time_range, RANGES["time_range"])
     found = _read_folder(absolute(path), format, poses, **options)
     return found.selected(time_range, keep_hot_pixels, keep_pose_gaps, undistort, smooth_poses)
 

@@ -99,9 +99,10 @@ def _messages(
                 )
                 raise FlagError(f"{path} holds {what}; {choice}.")
             able = [connection for connection in able if connection.topic == (topic or topics[0])]
-        for (connection, data), (_, following) in pairwise(chain(messages_on(bag, able), [(None, b"")])):
-            if connection.msgtype != PATH or len(following) <= len(data):
-                yield connection.msgtype, bag.deserialize(data, connection.msgtype)
+        messages = ((connection.msgtype, data) for connection, data in messages_on(bag, able))
+        for (kind, data), (_, following) in pairwise(chain(messages, [("", b"")])):
+            if kind != PATH or len(following) <= len(data):
+                yield kind, bag.deserialize(data, kind)
 
 
 def _of_tf(connections: Collection[Any], flags: PoseFlagNames) -> str:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from enerf_ns.dataparsers.recording.camera import LARGEST_SIDE
+from enerf_ns.dataparsers.recording import ranges
 from enerf_ns.dataparsers.recording.errors import FlagError
-from enerf_ns.dataparsers.recording.recording import DEPTH_LIMITS
+from enerf_ns.dataparsers.recording.ranges import COUNT, check_range, check_reading
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -19,9 +18,10 @@ MOST_STEPS = 10**9
 MOST_DRAWS = 2**24
 """Largest number of pairs, rays or samples that are drawn at once; more would fill any memory."""
 
-COUNT, WEIGHT, LEARNING_RATE = (0, 10**9), (0.0, 1e6), (1e-12, 1.0)
+WEIGHT, LEARNING_RATE = (0.0, 1e6), (1e-12, 1.0)
 
 RANGES: dict[str, tuple[float, float]] = {
+    **ranges.RANGES,
     "max_num_iterations": (1, MOST_STEPS),
     "evaluation_share": (0.0, 1.0),
     "steps_per_save": (1, MOST_STEPS),
@@ -52,15 +52,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "lr_final": LEARNING_RATE,
     "warmup_steps": (0, MOST_STEPS - 1),
     "max_steps": (1, MOST_STEPS),
-    "held_out_every": (1, 10**9),
-    "exposure_ms": (0.0, 1e6),
-    "downscale_factor": (1.0, LARGEST_SIDE),
-    "depth_range": DEPTH_LIMITS,
-    "box": (-DEPTH_LIMITS[1], DEPTH_LIMITS[1]),
-    "contraction_depth": DEPTH_LIMITS,
-    "time_range": (-4e9, 4e9),  # in ns, differences of int64 hold them
-    "train_frame_indices": COUNT,
-    "held_out_frame_indices": COUNT,
     "event_pairs": (1, MOST_DRAWS),
     "max_pair_distance": (1, 10**6),
     "instant_pairs": (0, MOST_DRAWS),
@@ -132,12 +123,9 @@ def check_ranges(config: TrainerConfig) -> None:
         FlagError: Names the first such number by its flag of ns-train.
     """
     pipeline: Any = config.pipeline
-    ranges = RANGES | pipeline.model.sensor._target.ranges()
+    known = RANGES | pipeline.model.sensor._target.ranges()
     for path, setting, values in _numbers((), "", config):
-        lowest, highest = ranges.get(setting, (-math.inf, math.inf))
-        if not all(math.isfinite(value) and lowest <= value <= highest for value in values):
-            expected = f"from {lowest:.10g} to {highest:.10g}" if setting in ranges else "finite"
-            raise FlagError(f"{_flag(path)} is {_shown(values)}, but must be {expected}.")
+        check_range(_flag(path), values, known.get(setting))
     _check_order(config)
 
 
@@ -149,18 +137,11 @@ def _check_order(config: TrainerConfig) -> None:
     """
     pipeline: Any = config.pipeline
     parser, model = pipeline.datamanager.dataparser, pipeline.model
-    for name in ("depth_range", "time_range"):
-        values = getattr(parser, name)
-        if values is not None and not values[0] < values[1]:
-            flag = _flag(("pipeline", "datamanager", "dataparser", name))
-            raise FlagError(f"{flag} is {_shown(values)}, but the second number must be above the first.")
-    if parser.box is not None and parser.box[3] < DEPTH_LIMITS[0]:
+    check_reading(parser, "event-data ")
+    if parser.contraction_depth is not None and model.contraction is False:
         raise FlagError(
-            f"event-data --box is {_shown(parser.box)}, but half its side must be at least {DEPTH_LIMITS[0]:g} m."
+            "event-data --contraction-depth contradicts --pipeline.model.contraction False; leave one of both out."
         )
-    if parser.contraction_depth is not None and (parser.box is not None or model.contraction is False):
-        other = "event-data --box" if parser.box is not None else "--pipeline.model.contraction False"
-        raise FlagError(f"event-data --contraction-depth contradicts {other}; leave one of both out.")
     if model.max_res is not None and model.max_res < model.base_res:
         raise FlagError(
             f"--pipeline.model.max-res is {model.max_res}, but must be at least --pipeline.model.base-res, which is "
@@ -207,7 +188,3 @@ def _flag(path: tuple[str, ...]) -> str:
     if path[:2] == ("pipeline", "poses"):
         path = (path[0], *path[2:])
     return "--" + ".".join(path).replace("_", "-")
-
-
-def _shown(values: Any) -> str:
-    return " ".join(f"{value:.10g}" if isinstance(value, float) else str(value) for value in values)

@@ -13,6 +13,7 @@ from rich.console import Console
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, printable, quoted
 from enerf_ns.dataparsers.recording.files import absolute, write_whole
+from enerf_ns.dataparsers.recording.ranges import check_reading
 from enerf_ns.report.scoring import Scoring
 from enerf_ns.scripts.format_options import format_flags
 
@@ -59,6 +60,7 @@ class Score:
             raise FlagError(
                 "There is nothing to score; give a folder of renders, or --views FILE to list the views to render."
             )
+        check_reading(self)
         data = absolute(self.recording)
         outputs = {"--views": self.views, "--output": self.output}
         for flag, path in outputs.items():

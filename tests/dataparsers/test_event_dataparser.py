@@ -311,7 +311,7 @@ def test_depth_that_cannot_be_measured_is_an_error_of_one_sentence_that_names_th
 @pytest.mark.parametrize("flag", [(4.0, 0.5), (0.0, 4.0), (1.0, 1.0), (0.5, float("inf")), (float("nan"), 4.0)])
 def test_a_depth_range_that_is_none_is_an_error(tmp_path: Path, flag: tuple[float, float]):
     parser = EventDataParserConfig(data=write_esim(tmp_path / "esim"), depth_range=flag).setup()
-    with pytest.raises(FlagError, match="depth range"):
+    with pytest.raises(FlagError, match="--depth-range is"):
         parser.outputs(parser.recording(), "train")
 
 
@@ -343,3 +343,31 @@ def test_a_time_range_limits_events_and_frames(tmp_path: Path):
     assert frame_numbers(outputs) == [1] and frame_numbers(parse(folder, "val", time_range=(0.2, 0.8))) == [1, 2]
     with pytest.raises(FlagError, match=r"--time-range 7 9 \(seconds\) holds none of the poses"):
         read_recording(folder, time_range=(7.0, 9.0))
+
+
+OUTSIDE = {
+    **{
+        f"{name} {value}": {name: value}
+        for name in ("exposure_ms", "downscale_factor")
+        for value in (np.nan, np.inf, -1)
+    },
+    **{f"contraction_depth {value}": {"contraction_depth": value} for value in (np.nan, np.inf, 0)},
+    **{f"held_out_every {value}": {"held_out_every": value} for value in (0, -3)},
+    **{f"box {side}": {"box": (0.0, 0.0, 0.0, side)} for side in (0.0, -1.0, np.nan)},
+    **{f"{name} {value}": {name: value} for name in ("time_range", "depth_range") for value in ((0.1, np.inf), (2, 1))},
+    "frames": {"held_out_frame_indices": (0, -1)},
+    "two": {"box": (0.0, 0.0, 0.0, 1.0), "contraction_depth": 1.0},
+}
+
+
+@pytest.mark.parametrize("options", OUTSIDE.values(), ids=OUTSIDE.keys())
+def test_numbers_outside_their_range_are_one_sentence_for_every_method(tmp_path: Path, options: dict):
+    config = EventDataParserConfig(data=write_esim(tmp_path / "esim"), **options)
+    flag = f"event-data --{[*options][-1].replace('_', '-')}"
+    with pytest.raises(SystemExit, match=rf"^enerf: {flag} (is .*, but .*must be .*|contradicts .*)\.$"):
+        config.setup().get_dataparser_outputs("train")
+
+
+def test_a_range_of_time_that_is_not_finite_is_refused_from_python(tmp_path: Path):
+    with pytest.raises(FlagError, match="--time-range is 0 inf, but must be from"):
+        read_recording(write_esim(tmp_path / "esim"), time_range=(0, np.inf))

@@ -159,3 +159,11 @@ def test_what_cannot_be_scored_is_said(recording: Path, tmp_path: Path):
         Score(recording, views=recording / "views.json").main()
     with pytest.raises(OutputError, match=r"--views .* could not be written"):
         Score(recording, views=tmp_path).main()
+
+
+@pytest.mark.parametrize("flags", [{"time_range": (0, np.inf)}, {"downscale_factor": 0.0}, {"held_out_every": 0}])
+def test_numbers_outside_their_range_are_refused(recording: Path, tmp_path: Path, flags: dict):
+    (name,) = flags
+    with pytest.raises(FlagError, match=f"^--{name.replace('_', '-')} is .*, but must be from"):
+        Score(recording, views=tmp_path / "views.json", **flags).main()
+    assert not (tmp_path / "views.json").exists()

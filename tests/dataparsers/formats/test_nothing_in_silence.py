@@ -135,9 +135,11 @@ def test_numbers_without_leading_zeros_are_in_order(tmp_path: Path, layout: str)
     for depth in (frames.depth_filenames, of_counted.depth_filenames):
         assert [number_of(file) for file in depth or ()] == [number_of(file) for file in frames.filenames if depth]
     for column in "xytp":
-        np.testing.assert_array_equal(
-            *(np.concatenate([getattr(events, column) for events in one.stream_events()]) for one in (padded, counted))
+        one, other = (
+            np.concatenate([getattr(events, column) for events in recording.stream_events()])
+            for recording in (padded, counted)
         )
+        np.testing.assert_array_equal(one, other)
 
 
 def number_of(file: Path) -> int:
