@@ -75,6 +75,10 @@ def same(one: Any, other: Any, where: str = "") -> None:
         assert one == other, where
 
 
+LEARNED = ("mean_threshold", "threshold_ratio", "threshold_map", "leak_rate", "cutoff_frequency", "response")
+ALL_LEARNED = {f"sensor__learn_{part}": True for part in LEARNED}
+
+
 @pytest.mark.sweep(4)
 @pytest.mark.parametrize("by", ["signal", "kill"])
 @pytest.mark.parametrize(
@@ -82,6 +86,7 @@ def same(one: Any, other: Any, where: str = "") -> None:
     [
         ({}, 0),
         ({"data__supervision": "events+frames", "data__silent_pairs": 32}, 0),
+        ({"data__supervision": "events+frames", "model__learn_exposure": True, **ALL_LEARNED}, 0),
         ({"data__supervision": "frames"}, 0),
         ({"model__sampling": "uniform"}, 0),
         ({}, 498),  # from step 501 on, the proposal network learns at every other step

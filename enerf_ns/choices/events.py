@@ -29,6 +29,10 @@ MOST_NOISE_BETWEEN, NOISE_OF_SCENE = 1.0, 0.125
 """Largest variance (squared thresholds) that noise may add to the events between any two instants, whose brightness is
 known little better; and the same as a share of the variance of the brightness that a pixel sees, if that is more."""
 
+LEAST_APART = 0.1
+"""Shortest time (ms) between any two instants. Between closer ones, errors are so small that, balanced by them, these
+pairs would outweigh all others."""
+
 SMALLEST_SILENT_SHARE = 0.01
 """Smallest share of the time for which pixels must be silent for silent pixels to be searched. If pixels are silent for
 less, the search finds hardly any."""
@@ -76,11 +80,20 @@ def event_pairs(scene: Scene) -> None:
 
 
 def any_instants(scene: Scene) -> None:
-    """Are pairs of any two instants drawn, and how far may their instants be apart?"""
+    """Are pairs of any two instants drawn, and how far may their instants be apart?
+
+    Raises:
+        FlagError: They are to be so close that nothing changes between them.
+    """
     if not scene.use_events:
         return
     name, value, pairs = "datamanager.instant_pairs", "", scene.value("datamanager.instant_pairs")
     apart = scene.use("datamanager.instants_apart_ms", lambda: _longest_worth_summing(scene) if pairs else 0.0)
+    if pairs and scene.given("datamanager.instants_apart_ms") is not None and apart < LEAST_APART:
+        raise FlagError(
+            f"--pipeline.datamanager.instants-apart-ms is {apart:g}, but {LEAST_APART:g} or more was expected, since "
+            "nothing changes in less; to draw no such pairs, give --pipeline.datamanager.instant-pairs 0."
+        )
     if pairs:
         value = f"{pairs} pairs a step, up to {apart:.3g} ms apart, whatever fired between them"
     why = "they constrain what a pixel sees between edges"

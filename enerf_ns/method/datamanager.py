@@ -377,7 +377,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         delays = sensor.blind_after(batch.start, batch.end) if batch.starts_at_events else None
         if delays is None:
             return None
-        delays[batch.silent] = 0.0
+        delays[batch.num_of_events :] = 0.0  # pairs of any instants, and silent ones, begin at no event
         return torch.cat([delays, torch.zeros_like(delays)])
 
     def correct(self, corrections: Corrections) -> None:

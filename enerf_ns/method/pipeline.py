@@ -329,7 +329,7 @@ class EnerfPipeline(VanillaPipeline):
             if sensor.learns_lag:
                 lags[..., 0] = 1.0 / sensor.cutoff_share(rgb, some.pixels.repeat(2)).view(2, -1).cpu()
             if sensor.refractory_period and some.starts_at_events:
-                lags[0, :, 1] = 1.0
+                lags[0, some.of_events, 1] = 1.0
         refiner.look(
             residual.double().cpu().numpy(),
             slopes,

@@ -209,9 +209,10 @@ class EnerfTrainerConfig(TrainerConfig):
         """
         filled = self.pipeline.resolution.applied_to(self.pipeline)
         parser = filled.datamanager.dataparser.setup()
-        box = parser.outputs(parser.recording(), "train").scene_box
+        outputs = parser.outputs(parser.recording(), "train")
+        num_frames = len(outputs.image_filenames)
         with torch.random.fork_rng():
-            model: EnerfModel = filled.model.setup(scene_box=box, num_train_data=0)
+            model: EnerfModel = filled.model.setup(scene_box=outputs.scene_box, num_train_data=num_frames)
         state = load_checkpoint(checkpoint)
         stored = {
             name.replace("_model.module.", "_model."): value

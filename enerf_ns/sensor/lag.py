@@ -167,7 +167,8 @@ class Lag(Thresholds):
             slope = slopes[:, instant]
             share = self.cutoff_share(rgb.detach(), batch.pixels)
             if batch.slopes is None or not self.learns_lag:
-                lag = (self.delay / share + self.second_delay) * slope
+                delay = self.delay if self._has_lag else torch.as_tensor(self.delay).detach()
+                lag = (delay / share + self.second_delay) * slope
             else:
                 delay = torch.as_tensor(self.delay)
                 lag = (delay.detach() / share + self.second_delay) * slope

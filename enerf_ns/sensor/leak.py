@@ -74,7 +74,7 @@ class Leak(Thresholds, RefractoryPeriod):
             seconds = 1e-9 * (batch.end - batch.start).double()
             blind = self.blind_after(batch.start, batch.end) if batch.starts_at_events else None
             if blind is not None:
-                seconds[batch.fired] -= 1e-9 * blind[batch.fired]
+                seconds[batch.of_events] -= 1e-9 * blind[batch.of_events]
             change = change - self.leak_rate * c_on * seconds.to(change.dtype)
         return change
 
