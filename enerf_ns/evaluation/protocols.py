@@ -84,6 +84,7 @@ def align(
     recorded: Sequence[Float[Tensor, "height width channels"]],
     protocol: str,
     colour_filter: bool = False,
+    encoded: bool = True,
 ) -> Aligned:
     """Fits and applies the correction of brightness of a protocol, in float64.
 
@@ -94,6 +95,7 @@ def align(
         recorded: Linear brightness in [0, 1].
         protocol: Name of one of `PROTOCOLS`.
         colour_filter: Whether the sensor has a colour filter.
+        encoded: Whether the pictures become the values that the protocol compares; otherwise they stay linear.
     """
     chosen = PROTOCOLS[protocol]
     aligned = list(rendered)
@@ -119,8 +121,10 @@ def align(
             for name, values in correction.parameters.items():
                 names = [name + colour for colour in COLOURS] if len(values) > 1 else [name]
                 parameters |= dict(zip(names, values.tolist(), strict=True))
-    encoded = [[chosen.encode(image) for image in images] for images in (aligned, recorded)]
-    return Aligned(encoded[0], encoded[1], faults, parameters)
+    pictures = aligned, list(recorded)
+    if encoded:
+        pictures = tuple([chosen.encode(image) for image in images] for images in pictures)
+    return Aligned(*pictures, faults, parameters)
 
 
 def _fault(x: Pixels, y: Pixels) -> str | None:

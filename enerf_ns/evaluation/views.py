@@ -79,13 +79,14 @@ class HeldOutView:
 
 
 def aligned_views(
-    views: Sequence[HeldOutView], protocol: str = DEFAULT_PROTOCOL
+    views: Sequence[HeldOutView], protocol: str = DEFAULT_PROTOCOL, encoded: bool = True
 ) -> tuple[list[HeldOutView], dict[str, float]]:
     """Views whose brightness a protocol has corrected. Views without frames stay unchanged.
 
     Args:
         views: As `held_out_views` gives them.
         protocol: Name of one of `PROTOCOLS`.
+        encoded: Whether pictures become the values that the protocol compares; otherwise they hold linear brightness.
 
     Returns:
         The views, whose renders are not clipped, and the parameters of the one fit over all of them, by name.
@@ -94,7 +95,7 @@ def aligned_views(
     if not framed:
         return list(views), {}
     recorded = [view.recorded for view in framed if view.recorded is not None]
-    pictures = align([view.rendered for view in framed], recorded, protocol, framed[0].colour_filter)
+    pictures = align([view.rendered for view in framed], recorded, protocol, framed[0].colour_filter, encoded)
     columns = zip(framed, pictures.rendered, pictures.recorded, pictures.faults, strict=True)
     aligned = iter([replace(view, rendered=a, recorded=b, not_aligned=fault) for view, a, b, fault in columns])
     return [view if view.recorded is None else next(aligned) for view in views], pictures.parameters

@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial import KDTree
 
 from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import read_json
 from enerf_ns.export.open3d_library import open3d
 from enerf_ns.simulator.event_sensor import SensorSettings
@@ -51,14 +52,23 @@ class SurfaceScores:
         )
 
 
-def simulated_scene(recording: Path) -> Scene | None:
-    """The scene of a simulated recording; None if the recording was not simulated from a scene."""
+def simulated_scene(recording: Path, notes: list[str]) -> Scene | None:
+    """The scene of a simulated recording; None if the recording was not simulated from a scene.
+
+    Args:
+        recording: Its folder.
+        notes: Gets a sentence if the file of the scene is not there any more, or cannot be used. Nothing is returned.
+    """
     file = recording / "simulation.json"
     about = read_json(file) if file.is_file() else {}
     if not about.get("scene"):
         return None
     settings = SimulationSettings(about["scene"], sensor=SensorSettings(seed=about.get("sensor", {}).get("seed", 0)))
-    return None if settings.pictures else scene_of(settings, [])
+    try:
+        return None if settings.pictures else scene_of(settings, [])
+    except RecordingError as error:
+        notes.append(f"Nothing is compared, since {str(error).rstrip('.')}; give the scene by --reference.")
+        return None
 
 
 def surface_scores(

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
+from enerf_ns.dataparsers.recording.files import absolute
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 
 if TYPE_CHECKING:
@@ -154,7 +155,9 @@ def load(config_file: Path) -> Run:
 def load_any_method(
     config_file: Path, test_mode: Literal["test", "val", "inference"]
 ) -> tuple[TrainerConfig, Pipeline]:
-    """Config and pipeline of a trained run of any of Nerfstudio's methods.
+    """Config and pipeline of a trained run of any of Nerfstudio's methods, with the checkpoint beside its config.yml.
+
+    Without a folder of checkpoints there, it is in the folder in which the run was trained.
 
     Args:
         config_file: config.yml of the run.
@@ -170,10 +173,16 @@ def load_any_method(
 
     from enerf_ns.terminal import without_chatter
 
+    def stored_here(config: TrainerConfig) -> TrainerConfig:
+        beside = absolute(config_file).parent / config.relative_model_dir.name
+        if beside.is_dir():
+            config.relative_model_dir = beside  # an absolute path, which is used in place of the folder of the run
+        return config
+
     allow_numpy_scalars_in_checkpoints()  # of runs on the data of another parser, too
     try:
         with without_chatter():
-            return eval_setup(config_file, test_mode=test_mode)[:2]
+            return eval_setup(config_file, test_mode=test_mode, update_config_callback=stored_here)[:2]
     except (Exception, SystemExit) as error:  # the kind depends on what is missing, or of another version
         reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
         if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):

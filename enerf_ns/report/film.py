@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,8 @@ def render_video(pipeline: EnerfPipeline, screen: Screen, path: dict[str, Any], 
         _write_mp4(partial, pictures(), int(path["fps"]))
         partial.replace(output)
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # as of a folder that cannot be written to
+            partial.unlink(missing_ok=True)
 
 
 def render_moving(pipeline: EnerfPipeline, screen: Screen, output: Path) -> None:

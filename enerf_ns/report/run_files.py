@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute, expanded, reading
 from enerf_ns.evaluation.history import HISTORY_FILE, HistoryRow, read_history
-from enerf_ns.method.checkpoints import newest_checkpoint, read_config
+from enerf_ns.method.checkpoints import load_checkpoint, newest_checkpoint, read_config
 from enerf_ns.method.origin import ORIGIN_FILE
 
 if TYPE_CHECKING:
@@ -54,6 +56,16 @@ class RunFiles:
     def folder(self) -> Path:
         """Folder of the run."""
         return self.config_file.parent
+
+    def seconds_at(self, step: int) -> float:
+        """Time (s) of training up to a step: in proportion between rows of the history; after its last row, which must
+        be there, that of the newest checkpoint."""
+        if step > self.history[-1].step and step == self.stored:
+            newest = newest_checkpoint(self.folder / "nerfstudio_models")
+            if newest is not None:
+                return float(load_checkpoint(newest)["error_against_time"]["seconds"])
+        steps, seconds = ([getattr(row, name) for row in self.history] for name in ("step", "seconds"))
+        return float(np.interp(step, steps, seconds))
 
     @property
     def learns_from(self) -> str:

@@ -37,7 +37,7 @@ def score_tables(reported: Sequence[Reported], unread: dict[str, str]) -> tuple[
             "scored frames": f"{'all' if one.over_all_frames else 'a few,'} {one.num_frames}"
             if one.num_frames
             else NONE,
-            "on the path": f"{on_path:.0f}" if (on_path := one.scores.get("held_out_on_path")) else NONE,
+            "on the path": NONE if (on_path := one.scores.get("held_out_on_path")) is None else f"{on_path:.0f}",
             "protocol": one.protocol if one.scores else NONE,
         }
         for one in reported

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError, UserError, quoted
@@ -168,7 +166,7 @@ def _look_at(one: Reported, run: Run | None, output_dir: Path, scoring: Scoring,
                 "The camera only turned, so that the run is a panorama: it has no depth, no mesh and no scores of "
                 "depth, and its pictures are right only for views from where the camera was."
             )
-        views, _ = aligned_views(views, scoring.protocol)
+        views, _ = aligned_views(views, scoring.protocol, encoded=False)
         one.columns = columns_of(views, dataset.recording, screen.exponent)
         one.caption = _caption(shown, len(dataset), stored, dataset.are_frames, screen)
         picture = _png(side_by_side(one.columns, views))
@@ -194,7 +192,7 @@ def _look_at(one: Reported, run: Run | None, output_dir: Path, scoring: Scoring,
     else:
         _take_preview(one)
     if history:
-        one.seconds = float(np.interp(one.step, [row.step for row in history], [row.seconds for row in history]))
+        one.seconds = one.files.seconds_at(one.step)
     elif run is not None:
         one.seconds = run.train_seconds
 

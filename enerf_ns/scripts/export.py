@@ -33,10 +33,12 @@ class Export:
     the run.
 
     Regions that no camera saw, or whose depth the events do not determine, stay empty. If the recording was simulated,
-    or a reference is given, the mesh or cloud is compared with it, and the scores are written into a .json file.
+    or a reference is given, the mesh or cloud is compared with it, and the scores are written beside it, as in
+    mesh.ply.json.
 
     Poses are those of the event camera after training, camera to world in OpenCV axes, on the clock of the events. The
-    file has one line t px py pz qx qy qz qw for each pose (TUM format). A .json file beside it holds the lens.
+    file has one line t px py pz qx qy qz qw for each pose (TUM format). The file poses.txt.json beside it holds the
+    lens.
 
     A packed run is a ZIP file with the run and its recording, which another machine unpacks and views.
     """
@@ -95,7 +97,7 @@ class Export:
 
         pipeline = load(files.config_file).pipeline
         path = pipeline.datamanager.recording.path
-        scene = scene or simulated_scene(path)
+        scene = scene or simulated_scene(path, notes)
         camera, views = surface_views(pipeline)
         voxel = self.voxel or VOXEL_PIXELS * pixel_size(camera, views)
         surface = (fused if self.what == "mesh" else points_of)(camera, views, voxel)
@@ -117,7 +119,7 @@ class Export:
         if scene is not None:
             scores = surface_scores(surface, scene, camera, [view.pose for view in views])
             table = {"reference": str(self.reference or path), "voxel": voxel, **asdict(scores)}
-            written[f"{output.stem}.json"] = (json.dumps(table, indent=2) + "\n").encode()
+            written[f"{output.name}.json"] = (json.dumps(table, indent=2) + "\n").encode()
             lines.append(str(scores))
         _write(output, written)
         for line in [*(f"note: {note}" for note in notes), *lines]:
@@ -131,7 +133,7 @@ class Export:
         found = [] if refiner is None else findings(refiner, pipeline.datamanager.distance)
         camera = {**camera_json(recording.camera), "corrections": [row.as_dict() for row in found]}
         about = (json.dumps(camera, indent=2) + "\n").encode()
-        _write(output, {output.name: encode_tum(recording.trajectory), f"{output.stem}.json": about})
+        _write(output, {output.name: encode_tum(recording.trajectory), f"{output.name}.json": about})
         corrected = [f"{row.what}: {row.value}" for row in found if row.is_corrected]
         for line in corrected or ["No error of the poses was found. They are those of the recording."]:
             print(printable(line))

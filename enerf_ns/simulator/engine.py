@@ -253,6 +253,8 @@ def _stated(settings: SimulationSettings, view: View, exposures: Exposures) -> d
     stated["num_frames"], stated["exposure_ms"] = len(exposures.times), exposures.exposure * 1e-6
     if settings.scene and not (settings.pictures or settings.key_frames or settings.trajectory):
         stated["motion"] = settings.motion or settings.preset.motion
+    if settings.scene and Path(settings.scene) in settings.reads:
+        stated["scene"] = absolute(settings.scene)  # for whoever compares with it from another folder
     return json.loads(json.dumps(stated, default=str))
 
 

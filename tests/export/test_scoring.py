@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,7 @@ def test_distances_to_a_mesh_are_exact():
 
 def test_the_scene_of_a_simulated_recording_has_its_depth(recording: Path):
     """In the axes of the recording and in metres: what its cameras saw lies on it."""
-    read, reference = read_recording(recording), simulated_scene(recording)
+    read, reference = read_recording(recording), simulated_scene(recording, [])
     assert reference is not None and read.frames is not None and read.frames.depth_filenames is not None
     pose = read.frames.trajectory.poses(torch.from_numpy(read.frames.times[3:4])).numpy()[0]
     depth = load_array(read.frames.depth_filenames[3])
@@ -73,5 +74,14 @@ def test_the_scene_of_a_simulated_recording_has_its_depth(recording: Path):
     assert np.abs(found[:, None] - expected).sum(-1).min(1).max() < 1e-3
 
 
+def test_a_scene_that_is_not_there_any_more_is_a_note(tmp_path: Path):
+    (tmp_path / "simulation.json").write_text('{"scene": "gone/room.json"}')
+    notes: list[str] = []
+    assert simulated_scene(tmp_path, notes) is None
+    assert re.match(
+        r"Nothing is compared, since gone/room\.json is neither .*; give the scene by --reference\.$", notes[0]
+    )
+
+
 def test_what_was_not_simulated_has_no_scene(tmp_path: Path):
-    assert simulated_scene(tmp_path) is None
+    assert simulated_scene(tmp_path, []) is None

@@ -86,6 +86,25 @@ def test_a_run_is_loaded_as_it_was_trained(run: Run):
     assert all(torch.equal(value, ours[name]) for name, value in parameters(run.pipeline).items())
 
 
+def test_of_a_run_that_was_copied_or_moved_the_checkpoint_beside_it_is_loaded(run: Run, tmp_path: Path):
+    """Not that of the folder in which it was trained, though config.yml names this one."""
+    trained, copied = tmp_path / "trained", tmp_path / "elsewhere/copy"
+    shutil.copytree(run.config_file.parent, trained / "recording/enerf/run")
+    config = yaml.load(run.config_file.read_text(), Loader=yaml.Loader)
+    config.output_dir = trained
+    (trained / "recording/enerf/run/config.yml").write_text(yaml.dump(config))
+    shutil.copytree(trained / "recording/enerf/run", copied)
+    (checkpoint,) = (copied / "nerfstudio_models").iterdir()
+    state = torch.load(checkpoint)
+    name = next(name for name, value in state["pipeline"].items() if value.is_floating_point())
+    state["pipeline"][name] += 1.0
+    torch.save(state, checkpoint)
+    for _ in ("copied", "moved"):
+        changed = parameters(load(copied / "config.yml").pipeline)[name]
+        torch.testing.assert_close(changed, parameters(run.pipeline)[name] + 1.0)
+        shutil.rmtree(trained, ignore_errors=True)
+
+
 def no_checkpoints(folder: Path) -> None:
     for file in (folder / "nerfstudio_models").iterdir():
         file.unlink()

@@ -134,6 +134,21 @@ def test_the_brightness_scale_stands_beside_what_it_should_be(
     assert ("The brightness scale is the factor" in text) == (cell is not None)
 
 
+def test_the_time_of_a_run_that_was_stopped_is_that_of_its_checkpoint(run: Run, tmp_path: Path):
+    """Its last row of the history is of an earlier step."""
+    folder = copied(run, tmp_path / "stopped", history(False)[:1], max_num_iterations=50)
+    (checkpoint,) = (folder / "nerfstudio_models").iterdir()
+    (scores,) = write_report([folder], tmp_path / "report", video=False).values()
+    assert scores["step"] == 2 > history()[0].step
+    assert scores["train_seconds"] == torch.load(checkpoint)["error_against_time"]["seconds"] != history()[0].seconds
+
+
+def test_a_run_of_no_held_out_frame_on_the_path_says_so(run: Run, tmp_path: Path):
+    row = HistoryRow(16, 2.0, {}, {"psnr": 18.0, "held_out_on_path": 0.0}, 3, final=True, protocol="log-affine-set")
+    write_report([copied(run, tmp_path / "run", [row], stored=False)], tmp_path / "report")
+    assert "on the path" in (tmp_path / "report/report.md").read_text()
+
+
 def test_scores_at_the_end_are_those_of_the_history(run: Run, tmp_path: Path):
     """Those of another step are taken anew, of the field of the newest checkpoint."""
     ended, going = copied(run, tmp_path / "ended", history()), copied(run, tmp_path / "going", history(False))

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import yaml
 from scipy.spatial.transform import Rotation
 from small_runs import SMALL
 
+from enerf_ns.dataparsers import event_dataparser
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 from enerf_ns.export import surface
@@ -51,17 +53,19 @@ def test_what_is_written_is_read_by_trimesh_and_scored(
     )
     assert len(points) > 50
     assert 0.3 < points[:, 1].mean() < 4.5 and np.abs(points).max() < 6.0  # y goes away from the camera, in metres
-    scores = json.loads(output.with_suffix(".json").read_text())
+    scores = json.loads((output.parent / f"{output.name}.json").read_text())
     assert scores["voxel"] == 0.1 and scores["chamfer"] == (scores["accuracy"] + scores["completeness"]) / 2
-    assert sorted(path.name for path in output.parent.iterdir()) == sorted([output.name, "scene.json"])
+    assert sorted(path.name for path in output.parent.iterdir()) == sorted([output.name, f"{output.name}.json"])
 
 
 def test_a_reference_takes_the_place_of_the_simulated_scene(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(surface, "SURE", 0.0)
     room = trimesh.creation.box((20.0, 20.0, 20.0))
     room.export(tmp_path / "room.ply")
+    (tmp_path / "mesh.json").write_text("of the user")
     Export("mesh", run, tmp_path / "mesh.ply", voxel=0.1, reference=tmp_path / "room.ply").main()
-    scores = json.loads((tmp_path / "mesh.json").read_text())
+    assert (tmp_path / "mesh.json").read_text() == "of the user"
+    scores = json.loads((tmp_path / "mesh.ply.json").read_text())
     assert 5.0 < scores["accuracy"] < 10.0 and scores["complete_share"] == 0.0
 
 
@@ -136,7 +140,7 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     expected = given.trajectory.poses(torch.from_numpy(times[inside] + 5_000_000)).numpy()
     np.testing.assert_allclose(rows[inside, 1:4], expected[:, :, 3], atol=1e-6)
     np.testing.assert_allclose(Rotation.from_quat(rows[inside, 4:]).as_matrix(), expected[:, :, :3], atol=1e-6)
-    camera = json.loads((tmp_path / "poses.json").read_text())
+    camera = json.loads((tmp_path / "poses.txt.json").read_text())
     assert camera["fx"] == given.camera.fx
     assert [row["is_corrected"] for row in camera["corrections"]] == [True] + 5 * [False]
     assert "Corrections of the poses" in (tmp_path / "inspect.html").read_text()
@@ -187,6 +191,47 @@ def test_a_packed_run_is_rendered_elsewhere_though_the_original_is_gone(
     for name, value in loaded.pipeline.model.state_dict().items():
         torch.testing.assert_close(value, here[name], rtol=0, atol=0)
     assert held_out_views(loaded.pipeline, evidence=False)[0][0].rendered.isfinite().all()
+
+
+def test_folders_that_are_links_are_packed_as_folders(run: Path, recording: Path, tmp_path: Path):
+    linked = tmp_path / "linked"
+    linked.mkdir()
+    for part in recording.iterdir():
+        (linked / part.name).symlink_to(part)
+    (linked / "circle").symlink_to(linked)
+    config = copied(run, tmp_path / "run", data=linked)
+    Export("run", config, tmp_path / "run.zip").main()
+    names = zipfile.ZipFile(tmp_path / "run.zip").namelist()
+    there = {f"recording/{file.relative_to(recording).as_posix()}" for file in recording.rglob("*") if file.is_file()}
+    assert {name for name in names if name.startswith("recording/")} == there
+
+
+def test_a_recording_that_is_not_whole_alone_is_not_packed(run: Path, recording: Path, tmp_path: Path, monkeypatch):
+    """As one of EVIMO2, of which the name of a folder above states the camera."""
+    config = copied(run, tmp_path / "run", data=recording)
+    read = event_dataparser.read_recording
+
+    def by_its_place(path: Path, *args: Any, **options: Any) -> Any:
+        if path != recording:
+            raise RecordingError(f"{path} lies in no folder left_camera, which names the camera.")
+        return read(path, *args, **options)
+
+    monkeypatch.setattr(event_dataparser, "read_recording", by_its_place)
+    with pytest.raises(
+        RecordingError, match=r"cannot be packed, since .* \(it lies in no folder left_camera.*enerf convert"
+    ):
+        Export("run", config, tmp_path / "run.zip").main()
+    assert not (tmp_path / "run.zip").exists()
+
+
+def copied(run: Path, folder: Path, data: Path) -> Path:
+    """A copy of a run on another recording."""
+    shutil.copytree(run, folder)
+    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    manager = config.pipeline.datamanager
+    config.data = manager.data = manager.dataparser.data = data
+    (folder / "config.yml").write_text(yaml.dump(config))
+    return folder
 
 
 def test_a_run_whose_recording_is_gone_is_not_packed(recording: Path, tmp_path: Path):
