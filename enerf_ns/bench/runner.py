@@ -100,7 +100,12 @@ class Bench:
         if weights is not None and not expanded(weights).is_file():
             raise FlagError(f"--reconstruction-weights {weights} does not exist; give a file of E2VID's or FireNet's.")
         parse_budget(settings.budget)
-        conditions = {"experiment": name, **{what: getattr(settings, what) for what in ("budget", "scale", "method")}}
+        self.output_dir = absolute(settings.output_dir)
+        check_outside_recordings("--output-dir", self.output_dir)
+        own = self.output_dir / f"{name}.json"
+        if settings.against is not None and absolute(settings.against) == own:
+            raise FlagError(f"--against {own} is the file that this bench writes; give another --output-dir.")
+        conditions = {"experiment": name, "budget": settings.budget, "scale": self.scale, "method": settings.method}
         self.before = _results_of(settings.against, conditions)
         """Results in the file of --against; None if not given."""
         if not 0.0 < settings.scale <= 4.0:
@@ -113,9 +118,7 @@ class Bench:
                 raise FlagError(f"--threads is {settings.threads}, but must be from 1 to {most}.")
             numba.set_num_threads(settings.threads)  # starts OpenMP, with a number of threads of its own for torch, too
             torch.set_num_threads(settings.threads)
-        self.output_dir = absolute(settings.output_dir)
-        check_outside_recordings("--output-dir", self.output_dir)
-        self._stored = _stored_runs(self.output_dir / f"{name}.json")
+        self._stored = _stored_runs(own)
 
     @property
     def cells(self) -> list[Cell]:
@@ -164,10 +167,10 @@ class Bench:
         return {
             "experiment": self.name,
             "sentence": experiment.sentence,
-            "command": self._command(),
+            "command": self.command(),
             "method": settings.method,
             "budget": settings.budget,
-            "scale": settings.scale if self.sequences[0] in experiment.sequences else None,
+            "scale": self.scale,
             "columns": experiment.columns,
             "protocols": experiment.protocols,
             "mean": experiment.mean,
@@ -182,8 +185,17 @@ class Bench:
             "runs": [{name: value for name, value in run.items() if name != "settings"} for run in runs],
         }
 
-    def _command(self) -> str:
-        """The command that makes these results, without the user's own paths."""
+    @property
+    def scale(self) -> float | None:
+        """Size of the simulated pictures as a factor; None for recordings of the user."""
+        return self.settings.scale if self.sequences[0] in self.experiment.sequences else None
+
+    def command(self, of_machine: bool = False) -> str:
+        """The command that makes these results, but for its output folder.
+
+        Args:
+            of_machine: Whether it has the user's own paths, so that it runs as it is.
+        """
         words, default = ["enerf", "bench", self.name], BenchSettings()
         for name, value in vars(self.settings).items():
             if name in ("output_dir", "threads", "against") or (
@@ -192,7 +204,8 @@ class Bench:
                 continue
             values = value if isinstance(value, tuple) else [value]
             words.append(f"--{name.replace('_', '-')}")
-            words += [f"path/to/{value.name}" if isinstance(value, Path) else str(value) for value in values]
+            own_path = isinstance(value, Path) and not of_machine
+            words += [f"path/to/{value.name}"] if own_path else map(str, values)
         return shlex.join(words)
 
     def _method(self, cell: Cell) -> str:

@@ -20,6 +20,7 @@ from enerf_ns.dataparsers.recording.files import (
     load_array,
     load_image,
 )
+from enerf_ns.dataparsers.recording.hdf5_files import is_deep_picture
 from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_level
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.evaluation.views import HeldOutView
@@ -27,6 +28,9 @@ from enerf_ns.evaluation.views import HeldOutView
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 ARRAY = ".npy"
 """Suffix of files with linear brightness in floats, shape (height, width), (height, width, 1) or (height, width, 3)."""
+
+DEEPEST = 2.0**16 - 1
+"""Full brightness in renders of 16 bits of frames of 8 bits."""
 
 THUMBNAIL = 32
 """Most pixels along a side of the pictures by which the order of renders is checked."""
@@ -81,7 +85,7 @@ def rendered_views(folder: Path, frames: Frames, colour_filter: bool) -> list[He
                 f"{file} has {found[0]} x {found[1]} pixels, but its frame has {camera.width} x {camera.height}; "
                 "render the size of the frames, or give the factor between both by --downscale-factor."
             )
-    white = find_white_level(tuple(pictures))
+    white = _white_level(tuple(pictures), frames)
     return [
         HeldOutView(
             recorded=_in_colour(brightness(frames.picture(number))),
@@ -93,6 +97,20 @@ def rendered_views(folder: Path, frames: Frames, colour_filter: bool) -> list[He
         )
         for number, file in enumerate(files)
     ]
+
+
+def _white_level(pictures: tuple[Path, ...], frames: Frames) -> float:
+    """The value of full brightness in renders of more than 8 bits. Dark renders do not show it by their largest value.
+
+    Integers are on the scale of the frames, or have 16 bits if frames have 8, or more bits if the renders need them.
+    Floats are on the scale of the frames if frames have more than 8 bits and some render exceeds 1, else linear.
+    """
+    found = find_white_level(pictures)
+    of_frames = frames.white_level if is_deep_picture(frames.filenames[0]) else None
+    deep = next((picture for picture in pictures if is_deep_picture(picture)), None)
+    if deep is not None and load_image(deep).dtype == np.float32:
+        return of_frames if of_frames and found > 1.0 else 1.0
+    return max(found, of_frames or DEEPEST)
 
 
 def better_fits(views: Sequence[HeldOutView]) -> list[tuple[int, int]]:

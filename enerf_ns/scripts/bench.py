@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from enerf_ns.bench.settings import BenchSettings
-from enerf_ns.dataparsers.recording.errors import FlagError, printable, quoted
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable, quoted
 
 if TYPE_CHECKING:
     from enerf_ns.report.tables import Table
@@ -50,7 +50,8 @@ class Bench:
         where = bench.output_dir / self.experiment
         drawn = ", error against time in .png" if where.with_suffix(".png").exists() else ""
         print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
-        print(f"compare later results with it: enerf bench {self.experiment} --against {quoted(where)}.json")
+        later = f"--output-dir NEW --against {quoted(f'{where}.json')}"
+        print(printable(f"compare later results with it: {bench.command(of_machine=True)} {later}"))
         if bench.before is not None:
             changes = changes_since(table, bench.before)
             CONSOLE.print(changes_table(changes, str(self.settings.against)).rich())
@@ -58,6 +59,9 @@ class Bench:
             if lost or not changes:
                 what = f"{'; '.join(lost)} lost more than {LARGEST_LOSS:g} dB" if lost else "No row is in both tables"
                 raise FlagError(f"{what} against {self.settings.against}.")
+        failed = sum("failure" in result for result in results)
+        if failed:
+            raise RecordingError(f"{failed} of {len(results)} trainings failed, for the reasons above.")
 
 
 def _experiments() -> Table:

@@ -119,6 +119,8 @@ def test_results_of_other_conditions_are_not_compared(finished: Path, tmp_path: 
     before = json.loads((finished / "design.json").read_text())
     Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": finished / "design.json"}))
     (tmp_path / "before.json").write_text(json.dumps({**before, what: value}))
+    with pytest.raises(FlagError, match=r"design\.json is the file that this bench writes; give another --output-dir"):
+        Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": finished, "against": finished / "design.json"}))
     with pytest.raises(FlagError, match=f"results of {what} {value}, but this bench has {what} {before[what]}; give a"):
         Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": tmp_path / "before.json"}))
 
@@ -207,6 +209,15 @@ def test_a_recording_that_is_not_there_fails_its_rows_in_a_sentence(tmp_path: Pa
     assert finish(tmp_path, name="slider-depth", data=tmp_path / "nowhere", rows=("events",)) == ["events"]
     (run,) = json.loads((tmp_path / "slider-depth.json").read_text())["runs"]
     assert "nowhere" in run["failure"] and run["failure"].count(". ") == 0
+
+
+def test_results_on_a_recording_of_the_user_are_compared(tmp_path: Path):
+    """They have no scale of simulated pictures."""
+    finish(tmp_path, name="slider-depth", data=tmp_path / "nowhere", rows=("events",))
+    against, output_dir = tmp_path / "slider-depth.json", tmp_path / "new"
+    changes = {"data": tmp_path / "nowhere", "rows": ("events",), "against": against, "output_dir": output_dir}
+    before = Bench("slider-depth", BenchSettings(**{**SMALL_BENCH, **changes})).before
+    assert before is not None and before["scale"] is None
 
 
 def test_a_simulation_that_was_cut_short_is_not_used(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -34,18 +35,25 @@ def test_without_an_experiment_all_are_listed_with_a_sentence(call):
         assert f" {len(experiment.rows) * len(experiment.sequences or experiment.recorded)} " in line
 
 
-def test_each_training_the_table_and_where_it_lies_are_printed(call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_each_training_the_table_and_where_it_lies_are_printed(
+    call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.setitem(ROWS, "events", Row({"pipeline.model.nothing": 1}))  # fails at once
     data = str(tmp_path / "nowhere")
-    shown = call("left-out", "--data", data, "--rows", "events", "--output-dir", str(tmp_path), "--seeds", "2")
-    lines = shown.splitlines()
+    arguments = ["left-out", "--data", data, "--rows", "events", "--output-dir", str(tmp_path), "--seeds", "2"]
+    with pytest.raises(SystemExit, match=r"^enerf: 2 of 2 trainings failed, for the reasons above\.$"):
+        call(*arguments)
+    lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "[1/2] recording, events, seed 0 …"
     assert lines[1].startswith(
         "[1/2] recording, events, seed 0: The method enerf has no setting pipeline.model.nothing"
     )
     assert any(line.startswith("│ recording │ events │") for line in lines)
     assert f"The table is in {tmp_path / 'left-out'}.md, .json and .csv" == lines[-2]
-    assert lines[-1].endswith(f"enerf bench left-out --against {tmp_path / 'left-out.json'}")
+    same = shlex.join([word for word in arguments if word not in ("--output-dir", str(tmp_path))])
+    command = lines[-1].removeprefix("compare later results with it: ")
+    assert command.endswith(f" --output-dir NEW --against {tmp_path / 'left-out.json'}")
+    assert {*shlex.split(same)} < {*shlex.split(command)}
     assert {file.name for file in tmp_path.glob("left-out.*")} == {"left-out.md", "left-out.json", "left-out.csv"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from recordings import FRAME_TIMES, HEIGHT, WIDTH, image, write_davis, write_esim, write_image
@@ -72,6 +73,32 @@ def test_the_protocol_corrects_brightness(recording: Path, tmp_path: Path):
     raw, corrected = (scores(recording, renders, protocol)["scores"] for protocol in ("raw", "gamma-affine"))
     assert raw["psnr"] < 15 and corrected["psnr"] > 45
     assert corrected["gamma_factor"] == pytest.approx(2.0, rel=0.02)
+
+
+def deepened(folder: Path, pictures: dict[str, np.ndarray], white: int) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, picture in pictures.items():
+        cv2.imwrite(str(folder / name), np.rint(picture[..., ::-1] / 255 * white).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("white", [255, 4095, 65535])
+@pytest.mark.parametrize("kind", ["16 bits", "floats"])
+def test_dark_renders_of_more_than_8_bits_are_dark(recording: Path, tmp_path: Path, white: int, kind: str):
+    """Renders of a fifth of the brightness, of frames of 8, 12 and 16 bits: their largest value is no full one."""
+    if white > 255:
+        deepened(recording / "images", frames(), white)
+    darker = {name: 0.2 * picture for name, picture in frames().items()}
+    if kind == "16 bits":
+        renders = deepened(tmp_path / "renders", darker, white if white > 255 else 65535)
+    else:
+        renders = tmp_path / "renders"
+        renders.mkdir()
+        for name, picture in darker.items():
+            stored = np.float32(picture[..., ::-1] / 255)
+            cv2.imwrite(str(renders / name.replace(".png", ".tif")), stored, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    expected = np.mean([-10 * np.log10(np.mean((0.8 * picture / 255) ** 2)) for picture in frames().values()])
+    assert scores(recording, renders)["scores"]["psnr"] == pytest.approx(expected, abs=0.05)
 
 
 def test_renders_without_the_names_of_frames_count_in_the_order_of_their_numbers(recording: Path, tmp_path: Path):
