@@ -462,8 +462,8 @@ class EventRecording:
             )
         if self.response is not None and not _is_response(self.response):
             raise ValueError(
-                f"the response {self.response!r}, but linlog, or logarithm:OFFSET with an offset above 0, such as "
-                "logarithm:0.001, was expected."
+                f"the response {self.response!r}, but linlog, or logarithm:OFFSET with an offset from 1e-9 to 1, such "
+                "as logarithm:0.001, was expected."
             )
         if not isinstance(self.reconstructed_by, str | None):
             raise ValueError(f"reconstructed_by = {self.reconstructed_by!r}, but a text was expected.")
@@ -519,12 +519,13 @@ def _check_exposures(times: Int64[np.ndarray, " frames"], exposures: Int64[np.nd
 
 
 def _is_response(name: object) -> bool:
-    """Returns whether a text has the form of a response's name, with any offset above 0."""
+    """Returns whether a text has the form of a response's name, with an offset that
+    `enerf_ns.sensor.response` takes."""
     if name == "linlog":
         return True
     kind, _, offset = name.partition(":") if isinstance(name, str) else ("", "", "")
     try:
-        return kind == "logarithm" and 0 < float(offset) < np.inf
+        return kind == "logarithm" and 1e-9 <= float(offset) <= 1
     except ValueError:
         return False
 

@@ -74,10 +74,23 @@ class Score:
             _write("--views", self.views, views_json(frames))
             print(printable(f"{len(frames.times)} held-out views of {data} are in {self.views}"))
             if self.renders is None:
-                print(printable(f"score their renders: enerf score RENDERS --recording {quoted(data)}"))
+                print(
+                    printable(f"score their renders: enerf score RENDERS --recording {quoted(data)}{self._selection()}")
+                )
                 return
         assert self.renders is not None
         self._score(absolute(self.renders), frames, recording.bayer_pattern is not None)
+
+    def _selection(self) -> str:
+        """The flags that select the held-out frames, as they were given."""
+        names = ("preset", "held_out_every", "held_out_frame_indices", "time_range", "downscale_factor")
+        given = {name: getattr(self, name) for name in names} | self.options.given()
+        words = []
+        for name, value in given.items():
+            if value is not None:
+                values = value if isinstance(value, tuple) else (value,)
+                words += [f"--{name.replace('_', '-')}", *map(str, values)]
+        return "".join(f" {quoted(word)}" for word in words)
 
     def _held_out(self, recording: Any) -> Any:
         """The held-out frames, chosen as training chooses them.

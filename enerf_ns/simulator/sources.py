@@ -22,7 +22,7 @@ from enerf_ns.dataparsers.recording.picture_depth import brightness, find_white_
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.runs import load_any_method
-from enerf_ns.sensor.response import Logarithm, Response
+from enerf_ns.sensor.response import Gamma, Logarithm, Response
 from enerf_ns.simulator.trajectories import POSES_PER_SECOND, sampled
 
 if TYPE_CHECKING:
@@ -264,7 +264,8 @@ class Video(Pictures):
 class TrainedRun:
     """A radiance field that Nerfstudio trained, seen by a pinhole camera that moves along a trajectory.
 
-    A run of this package renders linear brightness. Renderings of any other method are taken for sRGB.
+    A run of this package renders linear brightness or, with a response of gamma, encoded brightness, which is decoded.
+    Renderings of any other method are taken for sRGB.
 
     Args:
         config: config.yml of the run.
@@ -321,6 +322,9 @@ class TrainedRun:
         rgb = self._render(time, "rgb", pixels)
         if not self._is_linear:
             return linear_from_srgb(rgb.clip(0, 1)).astype(np.float32)
+        response = self._model.sensor.response
+        if isinstance(response, Gamma):
+            rgb = rgb.clip(0) ** np.float32(response.exponent)
         return rgb[..., 0] if self._model.config.num_channels == 1 else rgb
 
     def depth(self, time: int) -> Float32[np.ndarray, "height width"]:

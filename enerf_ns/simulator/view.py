@@ -199,7 +199,13 @@ def _centred(width: int, height: int, field_of_view: float) -> Camera:
     """A pinhole camera with its principal point in the middle, as the ESIM layout needs; field of view in degrees."""
     _check_size(width, height)
     focal_length = float(width / 2 / np.tan(np.radians(field_of_view / 2)))
-    return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+    try:
+        return Camera(width, height, focal_length, focal_length, width / 2, height / 2)
+    except ValueError as error:
+        raise FlagError(
+            f"--field-of-view is {field_of_view:g} degrees, which makes {str(error).partition(', which')[0]}, as no "
+            "lens has; give another."
+        ) from error
 
 
 def _end(settings: SimulationSettings, last: int, name: str) -> int:

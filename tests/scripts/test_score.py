@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tyro
 from recordings import FRAME_TIMES, HEIGHT, WIDTH, image, write_davis, write_esim, write_image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -186,6 +188,14 @@ def test_what_cannot_be_scored_is_said(recording: Path, tmp_path: Path):
         Score(recording, views=recording / "views.json").main()
     with pytest.raises(OutputError, match=r"--views .* could not be written"):
         Score(recording, views=tmp_path).main()
+
+
+def test_the_printed_command_scores_the_views_that_were_listed(recording: Path, tmp_path: Path, capsys):
+    flags = ["--held-out-every", "1", "--time-range", "0.0", "0.1", "--downscale-factor", "2.0"]
+    views = tmp_path / "views.json"
+    tyro.cli(Score, args=["--recording", str(recording), "--views", str(views), *flags]).main()
+    command = capsys.readouterr().out.splitlines()[-1].partition(": ")[2]
+    assert command == shlex.join(["enerf", "score", "RENDERS", "--recording", str(recording), *flags])
 
 
 @pytest.mark.parametrize("flags", [{"time_range": (0, np.inf)}, {"downscale_factor": 0.0}, {"held_out_every": 0}])

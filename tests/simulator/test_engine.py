@@ -171,6 +171,8 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
         (FlagError, dict(num_frames=10), "The layout esim needs at least 11 frames"),
         (FlagError, dict(exposure_ms=30.0), "The exposure of 30 ms does not fit frames 25 ms apart"),
         (FlagError, dict(field_of_view=180.0), "--field-of-view is 180.0, but must be"),
+        (FlagError, dict(field_of_view=179.99), "--field-of-view is 179.99 degrees, which makes a camera of .* as no"),
+        (FlagError, dict(field_of_view=0.001), "--field-of-view is 0.001 degrees, which makes a camera of .* as no"),
         (FlagError, dict(max_displacement=0.0), "--max-displacement is 0.0, but must be"),
         (FlagError, dict(width=0), "--width is 0, but must be"),
         (FlagError, dict(bayer_pattern="RGB"), "--bayer-pattern is RGB, but must be"),

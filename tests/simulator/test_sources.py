@@ -25,7 +25,7 @@ from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.held_out_views import held_out_views
-from enerf_ns.sensor.response import Logarithm
+from enerf_ns.sensor.response import Gamma, Logarithm
 from enerf_ns.simulator.scene.render import Renderer
 from enerf_ns.simulator.scene.scenes import SCENES
 from enerf_ns.simulator.sources import ImageFolder, RenderedScene, TrainedRun, Video, linear_from_srgb
@@ -321,6 +321,11 @@ def test_a_run_of_this_package_is_rendered_as_its_own_evaluation_does(tmp_path: 
         np.testing.assert_allclose(run.brightness(time), view.rendered[..., 0].numpy(), atol=1e-4)
         assert view.depth is not None
         np.testing.assert_allclose(run.depth(time), view.depth[..., 0].numpy(), rtol=1e-3)
+
+    run._model.sensor.response = Gamma(2.2)  # as if brightness were encoded
+    encoded = views[0].rendered[..., 0].clamp(min=0).numpy()
+    np.testing.assert_allclose(run.brightness(views[0].time - recording.trajectory.start), encoded**2.2, atol=1e-4)
+    run = TrainedRun(config)
 
     time = views[0].time - recording.trajectory.start
     pose = recording.trajectory.poses(torch.tensor([views[0].time])).numpy()[0]

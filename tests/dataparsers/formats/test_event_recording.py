@@ -433,6 +433,7 @@ BAD_ABOUT: dict[str, tuple[dict, str]] = {
     "colour unknown": ({"bayer_pattern": "RGGX"}, "the Bayer pattern 'RGGX', but four"),
     "period negative": ({"refractory_period_ns": -1}, "the refractory period -1 ns, but from 0"),
     "response unknown": ({"response": "log"}, "the response 'log', but linlog, or logarithm:OFFSET with an"),
+    "offset too large": ({"response": "logarithm:2.0"}, "with an offset from 1e-9 to 1"),
     "offset negative": ({"response": "logarithm:-1"}, "the response 'logarithm:-1', but"),
     "response no text": ({"response": 0.001}, "the response 0.001, but"),
     "reconstructed by a number": ({"reconstructed_by": 4}, "reconstructed_by = 4, but a text was expected"),
