@@ -133,8 +133,8 @@ def speak_for_methods(config: type, names: Sequence[str]) -> None:
 def shorten_help() -> None:
     """Makes tyro join the lines of the docstring of a flag, and leave out a default that is None or empty.
 
-    tyro 1.0.17 joins lines that begin with a letter, before it takes away the indent of the lines after the first. What
-    such a default means is said by the docstring.
+    tyro 1.0.17 joins lines that begin with a letter, before it takes away the indent of the lines after the first. The
+    docstring says what such a default means.
     """
     try:
         from tyro import _arguments, _docstrings

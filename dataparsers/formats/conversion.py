@@ -125,6 +125,7 @@ def convert_event_file(
         f"{num_events:,} events of {last * 1e-9:.3f} s ({file.encoding}) are written; their time 0, that of the first "
         f"event, is {file.start} ns on the clock of the file."
     )
+    sentences += file.notes
     missing = ["poses.txt"] * (poses is None)
     missing += ["model, fx, fy, cx, cy and distortion of the camera in recording.json"] * (camera is None)
     if missing:
@@ -139,7 +140,8 @@ def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
     if path is None:
         if file.size is None:
             raise RecordingError(
-                f"{file.path} does not state the size of its sensor; give a --camera file with width and height."
+                f"{file.path} does not state the size of its sensor; give a --camera file with width, height, model, "
+                "fx, fy, cx and cy."
             )
         return {"width": file.size[0], "height": file.size[1]}
     camera = event_recording.parse_camera(open_json(path))
@@ -162,6 +164,7 @@ def _check_is_free(output_dir: Path) -> None:
 @contextmanager
 def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
     """Yields a temporary folder, which becomes the output at the end of the block if no error occurs."""
+    output_dir = output_dir.resolve() if output_dir.is_symlink() else output_dir
     check_outside_recordings("--output-dir", output_dir, source)
     _check_is_free(output_dir)
     partial = partial_of(output_dir)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from codecs import BOM_UTF8
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
+from math import hypot
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +31,12 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events.txt", "groundtruth.txt", "calib.txt")
 
-DAVIS240C_SIZE = (240, 180)
-"""Width and height of the sensor in pixels, if there are no frames that state them."""
+SIZES = ((240, 180), (346, 260), (128, 128))
+"""Width and height in pixels of DAVIS240C, DAVIS346 and DVS128. Without frames, which state the size, the principal
+point tells the sensor."""
+
+OFF_MIDDLE = 0.15
+"""Largest distance of the principal point from the middle of a sensor, as a share of its sides."""
 
 EVENT_COLUMNS = "t_s x y p"
 BYTES_AT_A_TIME = 2**22
@@ -63,9 +68,13 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     zero = int(min(first_stamps))
     num_bytes = events_file.stat().st_size
 
-    width, height = image_size(frame_files[0]) if frame_files else DAVIS240C_SIZE
-    check_image_sizes(frame_files, width, height)
-    camera = _read_camera(folder / "calib.txt", width, height)
+    camera = _read_camera(folder / "calib.txt", image_size(frame_files[0]) if frame_files else None)
+    check_image_sizes(frame_files, camera.width, camera.height)
+    if (camera.width, camera.height) != SIZES[0] and not frame_files:
+        notes.append(
+            f"The sensor is taken to have {camera.width} x {camera.height} pixels, as the principal point in calib.txt "
+            "tells, since no frame states its size."
+        )
     trajectory = Trajectory(pose_times - zero, positions, quaternions)
     return EventRecording(
         path=folder,
@@ -108,10 +117,15 @@ def _read_frame_list(folder: Path, notes: list[str]) -> tuple[tuple[Path, ...], 
     return files, parse_times(path, [row[0] for row in rows], numbers, "s", "frames")
 
 
-def _read_camera(path: Path, width: int, height: int) -> Camera:
+def _read_camera(path: Path, size: tuple[int, int] | None) -> Camera:
     rows, numbers = read_rows(path, "fx fy cx cy k1 k2 p1 p2 k3")
     fx, fy, cx, cy, *distortion = parse_numbers(path, rows, numbers)[0].tolist()
     model = "radtan" if any(distortion) else "pinhole"
+    if size is None:
+        off_middle = {sides: hypot(cx / sides[0] - 0.5, cy / sides[1] - 0.5) for sides in SIZES}
+        likeliest = min(SIZES, key=off_middle.__getitem__)
+        size = likeliest if off_middle[likeliest] < OFF_MIDDLE else SIZES[0]
+    width, height = size
     with of_file(f"{path} (fx fy cx cy k1 k2 p1 p2 k3)"):
         return Camera(width, height, fx, fy, cx, cy, tuple(distortion) if any(distortion) else (), model)
 

@@ -56,6 +56,8 @@ class EventFile:
     stream: Callable[[], Iterator[Events]]
     """Function that yields all events in pieces, as they are in the file: polarity 0 or 1, times in ns from the first
     event. It raises RecordingError if the file is damaged."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what the file holds beside events, which is not read."""
 
 
 def open_event_file(path: Path) -> EventFile:
@@ -76,9 +78,10 @@ def open_event_file(path: Path) -> EventFile:
     if begin.startswith(b"#ROSBAG") or path.suffix in (".db3", ".mcap"):
         raise RecordingError(f"{path} is a ROS bag, which is read as a recording; give the folder that it lies in.")
     if begin.startswith(AEDAT4_MAGIC):
-        encoding, (size, microseconds) = "AEDAT4", _open_aedat4(path)
+        encoding, (size, microseconds, notes) = "AEDAT4", _open_aedat4(path)
     elif begin.startswith(b"%"):
         encoding, size, microseconds = _open_prophesee(path, begin, num_bytes)
+        notes = ()
     else:
         raise RecordingError(
             f"{path} begins with {begin[:12]!r}, but Prophesee's .raw (EVT2, EVT2.1, EVT3) and .dat files, which begin "
@@ -92,7 +95,7 @@ def open_event_file(path: Path) -> EventFile:
         for events in microseconds():
             yield Events(events.x, events.y, (events.t - first) * 1000, events.p)
 
-    return EventFile(path, encoding, size, first * 1000, stream)
+    return EventFile(path, encoding, size, first * 1000, stream, notes)
 
 
 EventStream = Callable[[], Iterator[Events]]
@@ -295,8 +298,8 @@ def evt3_decoder(path: Path) -> Callable[[np.ndarray], Events]:
     return decode
 
 
-def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
-    """Returns sensor size and events of an AEDAT4 file."""
+def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream, tuple[str, ...]]:
+    """Returns sensor size and events of an AEDAT4 file, and a sentence on its stream of frames, if it has one."""
     aedat = _import("aedat", path)
     _check_aedat4(path)
     streams = _guarded(path, lambda: aedat.Decoder(path).id_to_stream())
@@ -314,7 +317,10 @@ def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream]:
                 rows = packet["events"]
                 yield Events(rows["x"], rows["y"], rows["t"].astype(np.int64), rows["on"])
 
-    return (int(sensor["width"]), int(sensor["height"])), events
+    notes = ()
+    if any(stream["type"] == "frame" for stream in streams.values()):
+        notes = (f"The frames in {path.name} are not read, only its events are.",)
+    return (int(sensor["width"]), int(sensor["height"])), events, notes
 
 
 def read_exposures(path: Path) -> Int64[np.ndarray, "frames 2"]:

@@ -102,6 +102,14 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     stored = _parse_white_level(about), _parse_gamma(about)
     check_is_folder(folder / "depth", "a folder of depth maps")
     depth_files = files_in(folder / "depth", "*.npy")
+    frames = _read_frames(folder / "frames", poses_file, frame_camera, frame_trajectory, stored, depth_files)
+    blurred_frames = _read_frames(folder / "blurred_frames", poses_file, *blurred_rig, stored)
+    shallow = [kind.filenames[0] for kind in (frames, blurred_frames) if kind and not is_deep(kind.filenames[0])]
+    if stored[0] not in (None, 255) and len(shallow) == sum(kind is not None for kind in (frames, blurred_frames)) > 0:
+        raise RecordingError(
+            f"{path} holds white_level = {stored[0]:g}, but {shallow[0]} has 8 bits, of which 255 is white; leave "
+            "white_level out."
+        )
     with of_file(path):
         return EventRecording(
             path=folder,
@@ -110,8 +118,8 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _stream_events(folder / "events", columns),
             event_files=tuple(folder / "events" / f"{name}.npy" for name in STORED_TYPES),
-            frames=_read_frames(folder / "frames", poses_file, frame_camera, frame_trajectory, stored, depth_files),
-            blurred_frames=_read_frames(folder / "blurred_frames", poses_file, *blurred_rig, stored),
+            frames=frames,
+            blurred_frames=blurred_frames,
             reconstructed_by=reconstructed_by,
             contrast_thresholds=about.pair("contrast_thresholds", "two numbers above 0, of on and off events, were"),
             depth_range=about.pair("depth_range", "the nearest and the farthest depth in metres were"),
@@ -388,12 +396,7 @@ def _read_frames(
     files = _images_in(folder)
     rig = files, stamps_file, camera, trajectory
     frames = read_frames(*rig, depth_files, exposures_file, poses_file=poses_file)
-    if frames and white not in (None, 255) and not is_deep(files[0]):
-        raise RecordingError(
-            f"{folder.parent / 'recording.json'} holds white_level = {white:g}, but {files[0]} has 8 bits, of which "
-            "255 is white; leave white_level out."
-        )
-    return frames and replace(frames, stated_white=white, gamma=gamma)
+    return frames and replace(frames, stated_white=white if is_deep(files[0]) else None, gamma=gamma)
 
 
 def _images_in(folder: Path) -> list[Path]:

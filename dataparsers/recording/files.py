@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from decimal import Decimal
+from functools import cache
 from io import FileIO
 from pathlib import Path
 from typing import IO, Any
@@ -493,8 +494,12 @@ def remove_leftovers(folder: Path) -> None:
                     os.unlink(entry.path)
 
 
+@cache
 def _mark() -> str:
-    """Returns the part of a temporary name before the number of its process."""
+    """Returns the part of a temporary name before the number of its process: the machine and, on Linux, the namespace
+    of its processes, since two containers on one machine do not see each other's."""
+    with suppress(OSError):
+        return f".partial-{platform.node()}-{os.stat('/proc/self/ns/pid').st_ino}-"
     return f".partial-{platform.node()}-"
 
 

@@ -314,7 +314,8 @@ class ErrorAgainstTime:
         if self._last is not None and "psnr" in self._last.scores:
             parts.append(f"PSNR {self._last.scores['psnr']:.2f} dB at step {self._last.step}")
         elif self._last is not None and "event_correlation" in self._last.scores:
-            parts.append(f"{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
+            name = "event correlation " * (self._correlation is None)
+            parts.append(f"{name}{self._last.scores['event_correlation']:.3f} (held out) at step {self._last.step}")
         if self.verdict is not None and self.verdict.explained == "no":
             parts.append(self.verdict.short)
         return ", ".join(parts)

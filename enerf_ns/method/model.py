@@ -141,7 +141,7 @@ class EnerfModelConfig(ModelConfig):
     variation. Default: 0; for enerf-paper, 1."""
     frame_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the loss on frames. Default: 10 with frames alone; with events and frames, the weight that balances
-    their errors (`ErrorBalance`)."""
+    their errors."""
     learn_exposure: Optional[bool] = None  # noqa: UP045
     """Learn a gain and an offset of each frame. Default: True with events and frames, where pixels without an event
     between two frames changed, which shows that the exposure changed."""
@@ -150,7 +150,7 @@ class EnerfModelConfig(ModelConfig):
     Default: 0.1 where the field learns from events alone, which do not determine the level of brightness, else 0."""
     mean_brightness: Optional[float] = None  # noqa: UP045
     """Geometric mean of the brightness of the scene, where white is 1. A field that learns from events alone is held
-    near it. Default: the mean of the frames of the same camera, or `MEAN_BRIGHTNESS` where there are no frames."""
+    near it. Default: the mean of the frames of the same camera, or 0.3 where there are no frames."""
     opacity_loss_weight: Optional[float] = None  # noqa: UP045
     """Weight of the light that passes through the scene, 1 minus accumulation; 0 for an object before an empty
     background. Default: 0 where the border of the sensor is silent, else 1."""

@@ -34,7 +34,7 @@ class SimulationSettings:
 
     scene: Annotated[Optional[str], tyro.conf.Positional] = None  # noqa: UP045
     """Scene to simulate: a preset (spiral1, spiral2, shake-moon1, shake-moon2, shake-carpet1), a scene (shapes,
-    carpet, roads, moon, board), a mesh file (.glb, .gltf, .obj, .ply, .stl), a scene file (.json), a folder of
+    carpet, roads, moon, board), a mesh file (.glb, .gltf, .obj, .off, .ply, .stl), a scene file (.json), a folder of
     images, or a video."""
     from_run: Optional[Path] = None  # noqa: UP045
     """config.yml of a Nerfstudio run, which the simulator renders instead of a scene."""

@@ -53,19 +53,23 @@ def evt2_file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("exists", [False, True])
-def test_a_folder_of_another_format(tmp_path: Path, exists: bool, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize("exists", ["", "empty", "link"])
+def test_a_folder_of_another_format(tmp_path: Path, exists: str, capsys: pytest.CaptureFixture[str]):
     source = write_esim(tmp_path / "esim", frames=("images", "images_corrupted"))
     before = digests(source)
-    if exists:
+    if exists == "empty":
         (tmp_path / "new").mkdir()
+    elif exists == "link":
+        (tmp_path / "place").mkdir()
+        (tmp_path / "new").symlink_to("place")
     Convert(source, tmp_path / "new").main()
     assert digests(source) == before
     same_recording(read_recording(tmp_path / "new"), read_recording(source))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["esim", "new"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["esim", "new", *["place"] * (exists == "link")]
     printed = capsys.readouterr().out
     assert (
-        "6 events, 11 poses and 6 frames are written." in printed and f"The recording is in {tmp_path}/new" in printed
+        "6 events, 11 poses and 6 frames are written." in printed
+        and f"The recording is in {tmp_path}/{'place' if exists == 'link' else 'new'}" in printed
     )
 
 

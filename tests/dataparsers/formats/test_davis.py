@@ -51,6 +51,19 @@ def test_without_frames_the_sensor_is_the_davis240c(tmp_path: Path):
     assert (recording.camera.width, recording.camera.height) == (240, 180)
 
 
+@pytest.mark.parametrize(
+    ("middle", "size"), [((120.9, 94.1), (240, 180)), ((168.2, 134.5), (346, 260)), ((60, 70), (128, 128))]
+)
+def test_without_frames_the_principal_point_tells_the_sensor(
+    tmp_path: Path, middle: tuple[float, float], size: tuple[int, int]
+):
+    folder = write_davis(tmp_path / "davis", frames=False)
+    (folder / "calib.txt").write_text(f"300 300 {middle[0]} {middle[1]} 0 0 0 0 0\n")
+    recording = read_recording(folder)
+    assert (recording.camera.width, recording.camera.height) == size
+    assert [f"{size[0]} x {size[1]}" in note for note in recording.notes] == [True] * (size != (240, 180))
+
+
 def test_a_list_of_frames_without_the_folder_of_images_means_no_frames(tmp_path: Path):
     folder = write_davis(tmp_path / "davis")
     for file in (folder / "images").iterdir():

@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from recordings import (
     EVENTS,
     FRAME_TIMES,
@@ -28,6 +29,7 @@ from recordings import (
 from scipy.spatial.transform import Rotation, Slerp
 
 from enerf_ns.dataparsers.formats import event_recording
+from enerf_ns.dataparsers.formats.conversion import convert_recording
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.camera import Camera
@@ -635,3 +637,15 @@ def test_damaged_files_are_refused_or_read(fuzzed: Path, data: st.DataObject):
         assert "\n" not in str(error)
     finally:
         file.write_bytes(whole)
+
+
+def test_frames_of_16_bits_beside_blurred_ones_of_8_are_read_back(tmp_path: Path):
+    """The white level is that of the frames of 16 bits."""
+    folder = write_recording(tmp_path / "recording", frames=("frames", "blurred_frames"))
+    for i in range(len(FRAME_TIMES)):
+        Image.fromarray(image(i).squeeze().astype(np.uint16) * 15).save(folder / "frames" / f"{i}.png")
+    convert_recording(folder, tmp_path / "new")
+    before, after = read_recording(folder), read_recording(tmp_path / "new")
+    for kind in ("frames", "blurred_frames"):
+        np.testing.assert_array_equal(getattr(before, kind).image(0), getattr(after, kind).image(0))
+    assert before.frames is not None and before.frames.white_level == 4095
