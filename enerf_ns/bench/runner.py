@@ -204,8 +204,9 @@ class Bench:
                 continue
             values = value if isinstance(value, tuple) else [value]
             words.append(f"--{name.replace('_', '-')}")
-            own_path = isinstance(value, Path) and not of_machine
-            words += [f"path/to/{value.name}"] if own_path else map(str, values)
+            if isinstance(value, Path) and not of_machine:
+                values = [f"path/to/{value.name}"]
+            words += map(str, values)
         return shlex.join(words)
 
     def _method(self, cell: Cell) -> str:

@@ -121,10 +121,10 @@ def align(
             for name, values in correction.parameters.items():
                 names = [name + colour for colour in COLOURS] if len(values) > 1 else [name]
                 parameters |= dict(zip(names, values.tolist(), strict=True))
-    pictures = aligned, list(recorded)
+    frames = list(recorded)
     if encoded:
-        pictures = tuple([chosen.encode(image) for image in images] for images in pictures)
-    return Aligned(*pictures, faults, parameters)
+        aligned, frames = ([chosen.encode(image) for image in images] for images in (aligned, frames))
+    return Aligned(aligned, frames, faults, parameters)
 
 
 def _fault(x: Pixels, y: Pixels) -> str | None:

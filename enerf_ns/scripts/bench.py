@@ -50,7 +50,7 @@ class Bench:
         where = bench.output_dir / self.experiment
         drawn = ", error against time in .png" if where.with_suffix(".png").exists() else ""
         print(printable(f"The table is in {where}.md, .json and .csv{drawn}"))
-        later = f"--output-dir NEW --against {quoted(f'{where}.json')}"
+        later = f"--output-dir NEW --against {quoted(where.with_suffix('.json'))}"
         print(printable(f"compare later results with it: {bench.command(of_machine=True)} {later}"))
         if bench.before is not None:
             changes = changes_since(table, bench.before)

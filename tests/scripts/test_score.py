@@ -97,7 +97,7 @@ def test_dark_renders_of_more_than_8_bits_are_dark(recording: Path, tmp_path: Pa
         renders = tmp_path / "renders"
         renders.mkdir()
         for name, picture in darker.items():
-            stored = np.float32(picture[..., ::-1] / 255)
+            stored = (picture[..., ::-1] / 255).astype(np.float32)
             cv2.imwrite(str(renders / name.replace(".png", ".tif")), stored, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
     expected = np.mean([-10 * np.log10(np.mean((0.8 * picture / 255) ** 2)) for picture in frames().values()])
     assert scores(recording, renders)["scores"]["psnr"] == pytest.approx(expected, abs=0.05)
