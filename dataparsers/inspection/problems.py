@@ -370,10 +370,9 @@ def _pose_problems(
             f"{flag}.",
         )
     if len(swings):
-        before, after = swings[0]
         yield Problem(
-            f"The path through the poses swings by {_swings(recording, swings[:1])[0]:.3g} m between those at "
-            f"{before * 1e-9:.6f} s and {after * 1e-9:.6f} s, which lie on a straight way.",
+            f"The path through the poses swings by {_swings(recording, swings[:1])[0]:.3g} m at "
+            f"{swings[0].mean() * 1e-9:.2f} s, where they lie on a straight way.",
             "Two poses there have almost the same stamp, as if stamps were times of arrival: remove those whose stamp "
             f"is wrong from their file, or use a part without them: {flag}.",
         )

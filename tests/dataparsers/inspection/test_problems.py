@@ -134,7 +134,7 @@ PROBLEMS = {
     "too few poses": (dict(poses=changed_poses("rare")), r"turns by up to 4\d degrees from one", "every 200 ms"),
     "wrong pose": (dict(poses=changed_poses("wrong pose")), r"2 jumps; the largest is by 0.4 m and", "0.001 1.495"),
     "stamps of arrival": (
-        dict(poses=changed_poses("stamps of arrival")), r"swings by 0.184 m between those at 1.495", "0.001 1.495",
+        dict(poses=changed_poses("stamps of arrival")), r"swings by 0.184 m at 1.50 s", "0.001 1.495",
     ),
     "switched markers": (
         dict(poses=changed_poses("switched markers")), r"1 jump; .* by 0.3 m and .* at 1.25 s", "0.001 1.245",
