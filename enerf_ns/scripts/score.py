@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Optional, Tuple  # noqa: UP035 - tyro reads these annotations on Python 3.10
@@ -90,7 +91,7 @@ class Score:
             if value is not None:
                 values = value if isinstance(value, tuple) else (value,)
                 words += [f"--{name.replace('_', '-')}", *map(str, values)]
-        return "".join(f" {quoted(word)}" for word in words)
+        return f" {shlex.join(words)}" if words else ""
 
     def _held_out(self, recording: Any) -> Any:
         """The held-out frames, chosen as training chooses them.
