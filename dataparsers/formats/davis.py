@@ -1,4 +1,4 @@
-"""Reader for the text format of the UZH event-camera dataset, recorded with a DAVIS240C.
+"""Reader for the text format of the UZH event-camera dataset, recorded with a DAVIS240C, and of other DAVIS cameras.
 
     events.txt        t x y p, one event a line; seconds, pixels, polarity 0 or 1
     groundtruth.txt   t px py pz qx qy qz qw, one pose a line; camera to world, OpenCV axes, metres

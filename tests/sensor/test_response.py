@@ -1,13 +1,17 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from enerf_ns.dataparsers.recording.recording import _is_response
 from enerf_ns.sensor.response import (
+    LARGEST_OFFSET,
+    SMALLEST_OFFSET,
     ColourFilter,
     Gamma,
     Linlog,
@@ -164,4 +168,15 @@ def test_a_response_is_found_by_its_name(response):
 )  # fmt: skip
 def test_a_response_that_there_is_not_is_refused(name: str):
     with pytest.raises(ValueError, match=r"linlog, or logarithm:OFFSET .* was expected"):
+        response_named(name)
+
+
+@pytest.mark.parametrize(
+    ("offset", "is_taken"),
+    [(SMALLEST_OFFSET, True), (LARGEST_OFFSET, True), (0.9 * SMALLEST_OFFSET, False), (1.1 * LARGEST_OFFSET, False)],
+)
+def test_a_recording_states_what_a_sensor_may_have(offset: float, is_taken: bool):
+    name = f"logarithm:{offset!r}"
+    assert _is_response(name) == is_taken
+    with nullcontext() if is_taken else pytest.raises(ValueError, match="but linlog, or logarithm"):
         response_named(name)
