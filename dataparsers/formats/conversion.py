@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.json_values import open_json
@@ -82,7 +84,7 @@ def convert_event_file(
     camera: Path | None = None,
     finish: Finish | None = None,
 ) -> list[str]:
-    """Writes the events of a file, with poses and camera if given, into a new folder of the layout event_recording.
+    """Writes events and frames of a file, with poses and camera if given, into a folder of the layout event_recording.
 
     Args:
         source: .raw (EVT2, EVT2.1, EVT3), .dat or .aedat4; it is only read.
@@ -102,8 +104,9 @@ def convert_event_file(
     with new_folder(source, output_dir) as folder:
         file = open_event_file(source)
         about = _camera_json(file, camera)
-        rows = poses.rows({}, sentences) if poses is not None else None
         write_whole(folder / "recording.json", encode_json({"camera": about}))
+        frame_times = _write_frames(file, folder / "frames", about["width"], about["height"], sentences)
+        rows = poses.rows(frame_times, sentences) if poses is not None else None
         if rows is not None:
             event_recording.write_poses(folder / "poses.txt", rows[0] - file.start, *rows[1:])
         num_events, _, last = event_recording.write_events(
@@ -133,6 +136,49 @@ def convert_event_file(
             f"Before training, add {' and '.join(missing)}, as docs/formats.md shows (“Write a recording yourself”)."
         )
     return sentences
+
+
+def _write_frames(file: EventFile, folder: Path, width: int, height: int, sentences: list[str]) -> dict[str, int]:
+    """Writes the frames of a file, with the table of their times, and adds a sentence on those that are left out.
+
+    Returns:
+        The time (ns on the clock of the file) of each frame by the name of its picture.
+
+    Raises:
+        RecordingError: The file is damaged, or a frame goes back in time.
+        OSError: The disk is full.
+    """
+    times: dict[str, int] = {}
+    exposures: list[int] = []
+    num_others, last = 0, None
+    for frame in file.frames() if file.frames is not None else ():
+        if frame.pixels.shape[:2] != (height, width):
+            num_others += 1
+            continue
+        middle = (frame.begin + frame.end) // 2
+        if last is not None and middle <= last:
+            raise RecordingError(
+                f"{file.path} holds a frame at {middle} ns after one at {last} ns, but frames must be in time order; "
+                "record it again."
+            )
+        last, name = middle, f"{len(times):05d}.png"
+        folder.mkdir(exist_ok=True)
+        colour = frame.pixels[..., ::-1] if frame.pixels.ndim == 3 else frame.pixels
+        encoded = cv2.imencode(".png", colour, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1]
+        (folder / name).write_bytes(encoded.tobytes())
+        times[name] = middle
+        exposures.append(frame.end - frame.begin)
+    if times:
+        stamps = [time - file.start for time in times.values()]
+        (folder / event_recording.STAMPS_NAME).write_text("".join(f"{stamp}\n" for stamp in stamps))
+        sentences.append(f"{len(times):,} frames are written, with the times of the middle of their exposures.")
+    if any(exposures):
+        (folder / event_recording.EXPOSURES_NAME).write_text("".join(f"{exposure}\n" for exposure in exposures))
+    if num_others:
+        sentences.append(
+            f"{num_others:,} frames are left out, since the sensor has {width} x {height} pixels and they have others."
+        )
+    return times
 
 
 def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file, read_exposures
+from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import images_in
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses
@@ -73,7 +73,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     if not np.isfinite(rows).all():
         raise RecordingError(f"{path} holds numbers that are not finite; make it again.")
     camera = _camera(path, rows, file)
-    exposures = _exposures(file.path, len(rows) // POSES_OF_A_VIEW)
+    exposures = _exposures(file, len(rows) // POSES_OF_A_VIEW)
     files = tuple(image for image in images_in(folder / "images") if image.stem.isdecimal())
     files = tuple(image for image in files if int(image.stem) % POSES_OF_A_VIEW == 0)
     if files and len(files) != len(exposures):
@@ -156,9 +156,10 @@ def _camera(path: Path, rows: Float[np.ndarray, "poses 17"], file: EventFile) ->
         return Camera(width, height, focal_length, focal_length, (width - 1) / 2, (height - 1) / 2)
 
 
-def _exposures(path: Path, num_views: int) -> Int64[np.ndarray, "views 2"]:
+def _exposures(file: EventFile, num_views: int) -> Int64[np.ndarray, "views 2"]:
     """Returns begin and end of the exposure of each view, ns on the clock of the recording."""
-    found = read_exposures(path)
+    path = file.path
+    found = np.array([(frame.begin, frame.end) for frame in (file.frames() if file.frames else ())], np.int64)
     needed = FRAMES_OF_A_VIEW * (num_views - 1) + 1
     if len(found) < needed:
         raise RecordingError(

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Shaped
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import LARGEST_TEXT, reading
@@ -43,6 +44,18 @@ WORD_BYTES = {"EVT2": 4, "EVT2.1": 8, "EVT3": 2, "DAT": 8}
 
 
 @dataclass(frozen=True)
+class FileFrame:
+    """A frame of an event file."""
+
+    begin: int
+    """Begin of its exposure on the file's clock, ns."""
+    end: int
+    """End of its exposure. Where the file states no exposure, begin and end are the frame's stamp."""
+    pixels: Shaped[np.ndarray, "height width *channels"]
+    """Grey or RGB, uint8 or uint16."""
+
+
+@dataclass(frozen=True)
 class EventFile:
     """An event file that holds at least one event."""
 
@@ -56,6 +69,9 @@ class EventFile:
     stream: Callable[[], Iterator[Events]]
     """Function that yields all events in pieces, as they are in the file: polarity 0 or 1, times in ns from the first
     event. It raises RecordingError if the file is damaged."""
+    frames: Callable[[], Iterator[FileFrame]] | None = None
+    """Function that yields all frames in the order of the file, and raises RecordingError if the file is damaged. None
+    if it holds no stream of frames."""
     notes: tuple[str, ...] = ()
     """Sentences on what the file holds beside events, which is not read."""
 
@@ -77,11 +93,11 @@ def open_event_file(path: Path) -> EventFile:
         raise RecordingError(f"{path} is empty; an event file was expected.")
     if begin.startswith(b"#ROSBAG") or path.suffix in (".db3", ".mcap"):
         raise RecordingError(f"{path} is a ROS bag, which is read as a recording; give the folder that it lies in.")
+    frames, notes = None, ()
     if begin.startswith(AEDAT4_MAGIC):
-        encoding, (size, microseconds, notes) = "AEDAT4", _open_aedat4(path)
+        encoding, (size, microseconds, frames, notes) = "AEDAT4", _open_aedat4(path)
     elif begin.startswith(b"%"):
         encoding, size, microseconds = _open_prophesee(path, begin, num_bytes)
-        notes = ()
     else:
         raise RecordingError(
             f"{path} begins with {begin[:12]!r}, but Prophesee's .raw (EVT2, EVT2.1, EVT3) and .dat files, which begin "
@@ -95,7 +111,7 @@ def open_event_file(path: Path) -> EventFile:
         for events in microseconds():
             yield Events(events.x, events.y, (events.t - first) * 1000, events.p)
 
-    return EventFile(path, encoding, size, first * 1000, stream, notes)
+    return EventFile(path, encoding, size, first * 1000, stream, frames, notes)
 
 
 EventStream = Callable[[], Iterator[Events]]
@@ -298,45 +314,43 @@ def evt3_decoder(path: Path) -> Callable[[np.ndarray], Events]:
     return decode
 
 
-def _open_aedat4(path: Path) -> tuple[tuple[int, int], EventStream, tuple[str, ...]]:
-    """Returns sensor size and events of an AEDAT4 file, and a sentence on its stream of frames, if it has one."""
+def _open_aedat4(
+    path: Path,
+) -> tuple[tuple[int, int], EventStream, Callable[[], Iterator[FileFrame]] | None, tuple[str, ...]]:
+    """Returns sensor size, events and frames of an AEDAT4 file, and a sentence on frames that are not read."""
     aedat = _import("aedat", path)
     _check_aedat4(path)
     streams = _guarded(path, lambda: aedat.Decoder(path).id_to_stream())
-    sensors = {number: stream for number, stream in streams.items() if stream["type"] == "events"}
+    sensors = [number for number, stream in streams.items() if stream["type"] == "events"]
+    cameras = [number for number, stream in streams.items() if stream["type"] == "frame"]
     if len(sensors) != 1:
         raise RecordingError(
             f"{path} holds {len(sensors)} streams of events, but one was expected; export the one that is wanted."
         )
-    ((number, sensor),) = sensors.items()
 
-    def events() -> Iterator[Events]:
+    def packets(number: int, content: str) -> Iterator[Any]:
         decoder = _guarded(path, lambda: aedat.Decoder(path))
         while (packet := _guarded(path, lambda: next(decoder, None))) is not None:
-            if packet["stream_id"] == number and "events" in packet:
-                rows = packet["events"]
-                yield Events(rows["x"], rows["y"], rows["t"].astype(np.int64), rows["on"])
+            if packet["stream_id"] == number and content in packet:
+                yield packet[content]
+
+    def events() -> Iterator[Events]:
+        for rows in packets(sensors[0], "events"):
+            yield Events(rows["x"], rows["y"], rows["t"].astype(np.int64), rows["on"])
+
+    def frames() -> Iterator[FileFrame]:
+        for frame in packets(cameras[0], "frame"):
+            begin, end = int(frame["exposure_begin_t"]), int(frame["exposure_end_t"])
+            if not 0 < begin <= end:  # not stated
+                begin = end = int(frame["t"])
+            pixels = frame["pixels"]
+            yield FileFrame(begin * 1000, end * 1000, pixels[..., :3] if pixels.ndim == 3 else pixels)
 
     notes = ()
-    if any(stream["type"] == "frame" for stream in streams.values()):
-        notes = (f"The frames in {path.name} are not read, only its events are.",)
-    return (int(sensor["width"]), int(sensor["height"])), events, notes
-
-
-def read_exposures(path: Path) -> Int64[np.ndarray, "frames 2"]:
-    """Returns begin and end (ns on the clock of the file) of the exposure of each frame in an AEDAT4 file.
-
-    Raises:
-        RecordingError: The file is damaged, or aedat is not installed.
-    """
-    aedat = _import("aedat", path)
-    _check_aedat4(path)
-    decoder = _guarded(path, lambda: aedat.Decoder(path))
-    found = []
-    while (packet := _guarded(path, lambda: next(decoder, None))) is not None:
-        if "frame" in packet:
-            found.append((packet["frame"]["exposure_begin_t"], packet["frame"]["exposure_end_t"]))
-    return np.array(found, np.int64).reshape(-1, 2) * 1000
+    if len(cameras) > 1:
+        notes = (f"{path.name} holds {len(cameras)} streams of frames, of which none is read; export the one wanted.",)
+    sensor = streams[sensors[0]]
+    return (int(sensor["width"]), int(sensor["height"])), events, frames if len(cameras) == 1 else None, notes
 
 
 def _check_aedat4(path: Path) -> None:

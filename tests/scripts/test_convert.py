@@ -12,8 +12,10 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from aedat4_files import aedat4, events_packet, frame_packet
 from recordings import EVENTS, HEIGHT, POSE_TIMES, WIDTH, poses, write_davis, write_esim
 from scipy.spatial.transform import Rotation
 from test_event_files import BAD, FORMATS, events
@@ -127,6 +129,89 @@ def test_event_files(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[st
     )
     with pytest.raises(RecordingError, match=r"recording\.json lacks model, fx, fy, cx and cy in camera"):
         read_recording(tmp_path / "new", "event_recording")
+
+
+def write_aedat4(path: Path, frames: list[bytes], streams: tuple[str, ...] = ("EVTS", "FRME")) -> np.ndarray:
+    """Writes a file of 24 x 18 pixels, and returns its events (t in microseconds, x, y, p)."""
+    rng = np.random.default_rng(0)
+    columns = np.sort(rng.integers(0, 10**6, 900)) + 5_000_000, rng.integers(24, size=900), rng.integers(18, size=900)
+    rows = np.column_stack([*columns, rng.integers(2, size=900)])
+    packets = [(0, events_packet(rows)), *((1, frame) for frame in frames)]
+    path.write_bytes(aedat4((24, 18), streams, packets))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("kind", "channels"), [(np.uint8, 1), (np.uint16, 1), (np.uint8, 3), (np.uint16, 3), (np.uint8, 4)]
+)
+def test_frames_of_an_event_file(tmp_path: Path, kind: type, channels: int, capsys: pytest.CaptureFixture[str]):
+    """They lie beside the events, on their clock, and the new folder is read with them."""
+    pytest.importorskip("aedat")
+    shape = (7, 18, 24) if channels == 1 else (7, 18, 24, channels)
+    pictures = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
+    begins = [5_000_000 + 150_000 * number for number in range(len(pictures))]
+    frames = [frame_packet(begin, begin + 30_000, pixels) for begin, pixels in zip(begins, pictures, strict=True)]
+    frames.insert(3, frame_packet(begins[2] + 5000, begins[2] + 6000, pictures[0][:9]))  # of a part of the sensor
+    rows = write_aedat4(tmp_path / "a.aedat4", frames)
+    (tmp_path / "camera.json").write_text(
+        json.dumps({"width": 24, "height": 18, "model": "pinhole", "fx": 25.0, "fy": 25.0, "cx": 11.5, "cy": 8.5})
+    )
+    times = np.linspace(4.9, 6.1, 200)
+    (tmp_path / "poses.txt").write_text("".join(f"{t} {0.1 * t} 0 0 0 0 0 1\n" for t in times))
+    Convert(
+        tmp_path / "a.aedat4", tmp_path / "new", poses=tmp_path / "poses.txt", camera=tmp_path / "camera.json"
+    ).main()
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "7 frames are written" in printed and "1 frames are left out, since the sensor has 24 x 18 pixels" in printed
+    recording = read_recording(tmp_path / "new")
+    assert recording.frames is not None and recording.frames.exposures is not None
+    np.testing.assert_array_equal(recording.frames.times, 1000 * (np.array(begins) + 15_000 - rows[0, 0]))
+    assert (recording.frames.exposures == 30_000_000).all()
+    for file, pixels in zip(recording.frames.filenames, pictures, strict=True):
+        found = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(
+            found if channels == 1 else found[..., ::-1], pixels[..., :3] if channels > 1 else pixels
+        )
+
+
+def test_frames_of_an_event_file_give_times_to_poses_of_their_pictures(tmp_path: Path):
+    """COLMAP knows the names of the pictures that an earlier conversion wrote."""
+    pytest.importorskip("aedat")
+    pictures = np.random.default_rng(1).integers(0, 255, (30, 18, 24), np.uint8)
+    stamps = [4_990_000 + 40_000 * number for number in range(len(pictures))]
+    write_aedat4(
+        tmp_path / "a.aedat4", [frame_packet(0, 0, pixels, t) for t, pixels in zip(stamps, pictures, strict=True)]
+    )
+    Convert(tmp_path / "a.aedat4", tmp_path / "first").main()
+    names = sorted(file.name for file in (tmp_path / "first/frames").glob("*.png"))
+    assert not (tmp_path / "first/frames/exposures_ns.txt").exists()  # the file states none
+    frames = [
+        {
+            "file_path": f"frames/{name}",
+            "transform_matrix": [[1, 0, 0, 0.01 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        }
+        for i, name in enumerate(names)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    Convert(tmp_path / "a.aedat4", tmp_path / "new", poses=tmp_path / "transforms.json").main()
+    poses = np.loadtxt(tmp_path / "new/poses.txt")
+    np.testing.assert_array_equal(poses[:, 0], np.loadtxt(tmp_path / "new/frames/stamps_ns.txt"))
+    np.testing.assert_allclose(poses[:, 1], 0.01 * np.arange(len(names)), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["back in time", "two streams"])
+def test_frames_of_an_event_file_that_cannot_be_read(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("aedat")
+    frames = [frame_packet(t, t + 10, np.zeros((18, 24), np.uint8)) for t in (5_200_000, 5_100_000)]
+    convert = Convert(tmp_path / "a.aedat4", tmp_path / "new")
+    if name == "back in time":
+        write_aedat4(tmp_path / "a.aedat4", frames)
+        assert "holds a frame at 5100005000 ns after one at 5200005000 ns" in refused(tmp_path, convert)
+        return
+    write_aedat4(tmp_path / "a.aedat4", frames, ("EVTS", "FRME", "FRME"))
+    convert.main()
+    assert "holds 2 streams of frames, of which none is read" in " ".join(capsys.readouterr().out.split())
+    assert not (tmp_path / "new/frames").exists()
 
 
 @pytest.mark.parametrize(("unit", "nanoseconds"), [("s", 10**9), ("us", 1000), ("ns", 1)])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import aedat4_files
 import numpy as np
 import pytest
+from aedat4_files import events_packet, frame_packet
 from recordings import image, joined, write_image
 from scipy.spatial.transform import Rotation
 from test_bad_input import is_one_sentence
@@ -40,46 +41,15 @@ TRUE_EVENTS = np.column_stack(
 """x y t (µs on the clock of the recording) p."""
 
 
-def packet(stream: int, buffer: bytes) -> bytes:
-    content = struct.pack("<I", len(buffer)) + buffer
-    return struct.pack("<ii", stream, len(content)) + content
-
-
-def events_packet(rows: np.ndarray) -> bytes:
-    """A FlatBuffer with one field, a vector of structures."""
-    structs = b"".join(struct.pack("<qhh?3x", t, x, y, p) for x, y, t, p in rows.tolist())
-    fields, table = struct.pack("<3H", 6, 8, 4), struct.pack("<iI", 16 - 8, 28 - 20)
-    head = struct.pack("<I", 16) + b"EVTS" + fields.ljust(8, b"\0") + table.ljust(12, b"\0")
-    return packet(0, head + struct.pack("<I", len(rows)) + structs)
-
-
-def frame_packet(start: int, end: int) -> bytes:
-    """A FlatBuffer with stamps (of the frame, its begin and end, and the exposure), format, size, place and pixels."""
-    offsets = (8, 16, 24, 32, 40, 4, 48, 50, 52, 54, 56)
-    fields = struct.pack("<13H", 26, 60, *offsets).ljust(36, b"\0")
-    table = struct.pack("<ib3x5q4hI", 44 - 8, 0, start, start, end, start, end, WIDTH, HEIGHT, 0, 0, 4)
-    pixels = struct.pack("<I", WIDTH * HEIGHT) + bytes(WIDTH * HEIGHT)
-    return packet(1, struct.pack("<I", 44) + b"FRME" + fields + table + pixels)
-
-
 def aedat4(events: np.ndarray, exposure: int = EXPOSURE, frames: int = NUM_FRAMES) -> bytes:
-    nodes = "".join(
-        f'<node name="{i}" path="/mainloop/Recorder/outInfo/{i}/"><attr key="compression" type="string">NONE</attr>'
-        f'<attr key="typeIdentifier" type="string">{kind}</attr><node name="info" path="/info/"><attr key="sizeX" '
-        f'type="int">{WIDTH}</attr><attr key="sizeY" type="int">{HEIGHT}</attr></node></node>'
-        for i, kind in enumerate(("EVTS", "FRME"))
-    )
-    about = f'<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInfo/">{nodes}</node></dv>'.encode()
-    fields = struct.pack("<5H", 10, 24, 4, 8, 16)
-    table = struct.pack("<iiqI", 24 - 8, 0, -1, 24 - 16)
-    text = struct.pack("<I", len(about)) + about + b"\0"
-    header = struct.pack("<I", 24) + b"IOHE" + fields.ljust(16, b"\0") + table.ljust(24, b"\0") + text
-    parts = [b"#!AER-DAT4.0\r\n", struct.pack("<I", len(header)), header]
+    packets = []
     for number in range(frames):
         start = START + number * PERIOD
+        packets.append((1, frame_packet(start, start + exposure, np.zeros((HEIGHT, WIDTH), np.uint8))))
         within = events[(events[:, 2] >= start) & (events[:, 2] < start + PERIOD)]
-        parts += [frame_packet(start, start + exposure), *([events_packet(within)] if len(within) else [])]
-    return b"".join(parts)
+        if len(within):
+            packets.append((0, events_packet(within[:, [2, 0, 1, 3]])))
+    return aedat4_files.aedat4((WIDTH, HEIGHT), ["EVTS", "FRME"], packets)
 
 
 def true_poses() -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import aedat4_files
 import numpy as np
 import pytest
+from aedat4_files import events_packet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_fuzz import within_limits
@@ -119,29 +121,8 @@ def dat_header(*lines: str) -> bytes:
 
 
 def aedat4(rows: np.ndarray, streams: int = 1, kind: str = "EVTS", compress: Callable | None = None) -> bytes:
-    """Without a table at the end. A FlatBuffer starts with where its table lies, and the table with how far before it
-    its list of fields lies, which says where in the table each field is; `compress` is LZ4's."""
-    nodes = "".join(
-        f'<node name="{i}" path="/mainloop/Recorder/outInfo/{i}/"><attr key="compression" type="string">NONE</attr>'
-        f'<attr key="typeIdentifier" type="string">{kind}</attr><node name="info" path="/info/"><attr key="sizeX" '
-        f'type="int">{WIDTH}</attr><attr key="sizeY" type="int">{HEIGHT}</attr></node></node>'
-        for i in range(streams)
-    )
-    about = f'<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInfo/">{nodes}</node></dv>'.encode()
-    fields = struct.pack("<5H", 10, 24, 4, 8, 16)  # sizes of this and of the table; then of three fields, where
-    table = struct.pack("<iiqI", 24 - 8, compress is not None, -1, 24 - 16)  # then where data and text lie
-    text = struct.pack("<I", len(about)) + about + b"\0"
-    buffer = struct.pack("<I", 24) + b"IOHE" + fields.ljust(16, b"\0") + table.ljust(24, b"\0") + text
-    parts = [b"#!AER-DAT4.0\r\n", struct.pack("<I", len(buffer)), buffer]
-    for i in range(0, len(rows), 100):
-        part = rows[i : i + 100]
-        structs = b"".join(struct.pack("<qhh?3x", *row) for row in part.tolist())
-        fields, table = struct.pack("<3H", 6, 8, 4), struct.pack("<iI", 16 - 8, 28 - 20)
-        buffer = struct.pack("<I", 16) + kind.encode() + fields.ljust(8, b"\0") + table.ljust(12, b"\0")
-        buffer += struct.pack("<I", len(part)) + structs
-        content = (compress or bytes)(struct.pack("<I", len(buffer)) + buffer)
-        parts += [struct.pack("<ii", 0, len(content)), content]
-    return b"".join(parts)
+    packets = [(0, events_packet(rows[i : i + 100], kind)) for i in range(0, len(rows), 100)]
+    return aedat4_files.aedat4((WIDTH, HEIGHT), [kind] * streams, packets, compress)
 
 
 FORMATS: dict[str, tuple[str, Callable[[np.ndarray], bytes]]] = {
