@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from enerf_ns.dataparsers.recording.cache import cache_folder
+from enerf_ns.dataparsers.recording.cache import cache_entry
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
 from enerf_ns.dataparsers.recording.files import load_array, partial_of
 
@@ -41,7 +41,7 @@ def keep_frames(
     state = source.stat()
     made_from = repr((LAYOUT, str(source.resolve()), state.st_size, state.st_mtime_ns, name))
     try:
-        folder = cache_folder() / f"frames-{hashlib.sha256(made_from.encode()).hexdigest()[:32]}"
+        folder = cache_entry(f"frames-{hashlib.sha256(made_from.encode()).hexdigest()[:32]}")
         if not (folder / STAMPS).exists():
             _write(folder, source, name, frames())
     except OSError as error:

@@ -20,7 +20,7 @@ import torch
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.dataparsers.index.event_survey import EventStream, Survey, sorted_bands
-from enerf_ns.dataparsers.recording.cache import cache_folder
+from enerf_ns.dataparsers.recording.cache import cache_entry, cache_folder
 from enerf_ns.dataparsers.recording.files import partial_of
 
 LAYOUT = 4
@@ -45,7 +45,7 @@ def entry_name(**made_from: object) -> str:
 def load_index(name: str) -> tuple[EventIndex, Survey] | None:
     """An index from the cache, mapped into memory, and its survey. None if there is none. Removes a damaged entry."""
     try:
-        folder = cache_folder() / name
+        folder = cache_entry(name)
     except OSError:
         return None
     try:

@@ -11,7 +11,7 @@ import cv2
 from rich import get_console
 from rich.progress import track
 
-from enerf_ns.dataparsers.recording.cache import cache_folder
+from enerf_ns.dataparsers.recording.cache import cache_entry
 from enerf_ns.dataparsers.recording.errors import OutputError
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of
@@ -62,7 +62,7 @@ def _place(frames: Frames, source: Path) -> Path:
         (LAYOUT, str(source.parent.resolve()), lens, frames.downscale_factor, frames.white_level, frames.gamma)
     ).encode()
     table = b"" if directions is None else directions.tobytes()
-    return cache_folder() / f"pictures-{hashlib.sha256(made_from + table).hexdigest()[:32]}" / f"{source.stem}.png"
+    return cache_entry(f"pictures-{hashlib.sha256(made_from + table).hexdigest()[:32]}") / f"{source.stem}.png"
 
 
 def _is_current(place: Path, source: Path) -> bool:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import shutil
+import time
+from contextlib import suppress
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
 from enerf_ns.dataparsers.recording.files import expanded
+
+ENTRY = re.compile(r"((frames|pictures)-)?[0-9a-f]{32}")
+"""Name of an entry, a folder: kind and hash."""
+
+DAYS_KEPT = 30
+"""Days after which an entry that nobody used is removed, so that the cache does not grow for ever."""
 
 
 def cache_folder() -> Path:
@@ -29,3 +39,21 @@ def cache_folder() -> Path:
     if not folder.is_absolute():
         raise unknown
     return folder
+
+
+def cache_entry(name: str) -> Path:
+    """Folder of an entry, which may be missing. It counts as used now, and entries that have not been used for
+    `DAYS_KEPT` days are removed.
+
+    Raises:
+        OSError: The user has no home folder.
+    """
+    folder = cache_folder()
+    with suppress(OSError):  # it is missing, or another user's
+        os.utime(folder / name)
+    oldest = time.time() - DAYS_KEPT * 24 * 3600
+    with suppress(OSError):
+        for entry in list(os.scandir(folder)):
+            if ENTRY.fullmatch(entry.name) and entry.stat().st_mtime < oldest:
+                shutil.rmtree(entry.path, ignore_errors=True)
+    return folder / name

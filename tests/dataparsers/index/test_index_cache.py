@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ import torch
 from enerf_ns.dataparsers.index import index_cache
 from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.dataparsers.index.indexing import index_events
+from enerf_ns.dataparsers.recording.cache import DAYS_KEPT
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.recording import EventRecording, Events
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
@@ -94,6 +96,27 @@ def test_what_changes_the_index_changes_the_entry(source: Path, cache: Path):
     np.save(source, columns)
     assert index_events(recording(source, end=2 * 10**9)).span == (columns[2, 0], columns[2, -1])
     assert len(entries(cache)) == 4
+
+
+def test_what_was_not_used_for_long_is_removed(source: Path, cache: Path):
+    """An entry that is used stays however old it is, and so do files of somebody else."""
+    made = [recording(source, end) for end in (10**9, 500_000_000, 400_000_000)]
+    for one in made[:2]:
+        index_events(one).span  # noqa: B018
+    others = [f"{kind}-{'0123456789abcdef' * 2}" for kind in ("frames", "pictures")]
+    for name in (*others, "mine", "frames-mine"):
+        (cache / name).mkdir()
+    known, too_old = set(entries(cache)), time.time() - (DAYS_KEPT + 1) * 24 * 3600
+    for name in known:
+        os.utime(cache / name, (too_old, too_old))
+    index_events(recording(source)).span  # noqa: B018
+    (kept,) = set(entries(cache)) - {"mine", "frames-mine"}
+    again = recording(source)
+    assert index_events(again).span and not again.passes and kept in known  # type: ignore[attr-defined]
+    recent = time.time() - (DAYS_KEPT - 1) * 24 * 3600
+    os.utime(cache / kept, (recent, recent))
+    index_events(made[2]).span  # noqa: B018
+    assert kept in entries(cache) and len(entries(cache)) == 4
 
 
 @pytest.mark.parametrize("column", ["times", "positives", "counts", "index.json"])
