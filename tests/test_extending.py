@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -110,6 +113,51 @@ def test_a_reader_of_ones_own_can_be_named(two_arrays_folder: Path, tmp_path: Pa
     config = small_config(two_arrays_folder, tmp_path)
     config.pipeline.datamanager.dataparser = dataclasses.replace(two_arrays.config)  # type: ignore[type-var]
     assert two_steps(config).pipeline.datamanager.recording.format == "two_arrays"
+
+
+READER = """
+from pathlib import Path
+import numpy as np
+from enerf_ns.dataparsers.event_dataparser import specification
+from enerf_ns.dataparsers.formats.format import Format
+from enerf_ns.dataparsers.recording.camera import Camera
+from enerf_ns.dataparsers.recording.recording import EventRecording, Events
+from enerf_ns.dataparsers.recording.trajectory import Trajectory
+
+def read(folder: Path) -> EventRecording:
+    times, still = np.array([0, 10**9]), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+    return EventRecording(
+        path=folder,
+        format="mine",
+        camera=Camera(32, 24, 27.7, 27.7, 16.0, 12.0),
+        trajectory=Trajectory(times, np.array([[0.0, 0, 0], [1.0, 0, 0]]), still),
+        stream_events=lambda: iter([Events(*np.load(folder / "mine.npy"))]),
+        event_files=(folder / "mine.npy",),
+    )
+
+FORMAT = Format("mine", "my-events", "Mine.", ("mine.npy",), read)
+MINE = specification(FORMAT)
+"""
+
+
+def test_commands_know_a_format_that_another_package_names(tmp_path: Path):
+    """The package is found as pip would have installed it. Another one, which is broken, costs a warning alone."""
+    site = tmp_path / "site"
+    for name, reader in (("mine", READER), ("broken", "import a_module_that_is_missing")):
+        (site / f"{name}-1.0.dist-info").mkdir(parents=True)
+        (site / f"{name}-1.0.dist-info/METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (site / f"{name}-1.0.dist-info/entry_points.txt").write_text(f"[enerf_ns.formats]\n{name} = {name}:FORMAT\n")
+        (site / f"{name}.py").write_text(reader)
+    rng = np.random.default_rng(0)
+    columns = rng.integers(0, 32, 500), rng.integers(0, 24, 500), np.sort(rng.integers(0, 10**9, 500))
+    (tmp_path / "folder").mkdir()
+    np.save(tmp_path / "folder/mine.npy", np.stack([*columns, rng.integers(0, 2, 500)]))
+    command = [str(Path(sys.executable).with_name("enerf")), "convert", "folder", "--output-dir", "new"]
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(np.load(tmp_path / "new/events/t.npy"), columns[2])
+    assert "The format broken of the package broken is left out" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_loss_of_ones_own(recording: Path, tmp_path: Path):

@@ -1,16 +1,18 @@
 """The registry of all formats, which finds the format of a folder and reads it.
 
-A format is a module that defines a `Format`. To add one, write the module and name it in the loop over modules below,
-or call `register` from another package. A sub-command of `ns-train` also needs an entry point in
-nerfstudio.dataparser_configs.
+A format is a module that defines a `Format`. To add one, write the module and name it in the loop over modules below.
+In another package, name it by an entry point in the group enerf_ns.formats, or call `register`. A sub-command of
+`ns-train` also needs an entry point in nerfstudio.dataparser_configs.
 """
 
 from __future__ import annotations
 
 import os
+import warnings
 from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -61,7 +63,7 @@ def register(format: Format) -> None:
     Raises:
         ValueError: The name or command is taken, or the name is auto.
     """
-    taken = {name for known in formats() for name in (known.name, known.command)}
+    taken = {name for known in _FORMATS.values() for name in (known.name, known.command)}
     if format.name == "auto":
         raise ValueError("A format cannot be named auto, which stands for automatic detection; give it another name.")
     if format.name in taken or format.command in taken:
@@ -70,7 +72,8 @@ def register(format: Format) -> None:
 
 
 def formats() -> tuple[Format, ...]:
-    """Returns all formats in the order of their registration."""
+    """Returns all formats in the order of their registration, with those that other packages name by entry points."""
+    _load_entry_points()
     return tuple(_FORMATS.values())
 
 
@@ -80,9 +83,10 @@ def format_named(name: str) -> Format:
     Raises:
         FlagError: There is none.
     """
-    if name not in _FORMATS:
-        raise FlagError(f"The format {name!r} is not known; give one of {', '.join(_FORMATS)}, or auto to find out.")
-    return _FORMATS[name]
+    known = {format.name: format for format in formats()}
+    if name not in known:
+        raise FlagError(f"The format {name!r} is not known; give one of {', '.join(known)}, or auto to find out.")
+    return known[name]
 
 
 def read_recording(
@@ -153,6 +157,22 @@ for _module in (
     *(ros_bag, m3ed, dsec, e2nerf, event_recording),
 ):
     register(_module.FORMAT)
+
+
+@cache
+def _load_entry_points() -> None:
+    """Registers the formats of other packages, when formats are asked for, so that their modules can import this one.
+
+    One that cannot be loaded is left out with a warning, since it would otherwise break every command.
+    """
+    for entry in entry_points(group="enerf_ns.formats"):
+        try:
+            register(entry.load())
+        except Exception as error:
+            of = f" of the package {entry.dist.name}" if entry.dist else ""
+            warnings.warn(
+                f"The format {entry.name}{of} is left out, since {entry.value} cannot be used ({error}).", stacklevel=2
+            )
 
 
 @cache
