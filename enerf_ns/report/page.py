@@ -164,10 +164,6 @@ def _column_on_page(column: Column) -> dict[str, Any]:
     }
 
 
-def _uri_of(picture: UInt8[np.ndarray, "height width 3"]) -> str:
-    return data_uri("image/webp", webp(picture))
-
-
 def _fitted(picture: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "tall wide 3"]:
     """The picture at a size for the page. Its pixels become whole squares if it is small."""
     height, width = picture.shape[:2]
