@@ -18,6 +18,8 @@ EVENTS_IN_PICTURE = 0.2
 """Most events in one picture, as a share of the sensor's pixels."""
 EVENTS_AT_ONCE = 2**22
 """Events whose times are compared at once, which limits memory."""
+STAMPS_COMPARED = 100_000
+"""Stamps, evenly from all pixels, that tell the resolution of a clock."""
 ON_COLOUR, OFF_COLOUR, NO_EVENT = (205, 50, 50), (50, 70, 205), (255, 255, 255)
 """Colours (red, green, blue) of on events, of off events, and of pixels without events."""
 
@@ -86,6 +88,12 @@ class EventIndex:
     def num_positive(self) -> int:
         """Number of positive events. The others are negative."""
         return int(self.positives[-1]) if len(self) else 0
+
+    @cached_property
+    def resolution(self) -> int:
+        """Step of the clock, ns: the greatest common divisor of the times between stamps; 1 if all are equal."""
+        stamps = self.times[:: max(1, len(self.times) // STAMPS_COMPARED)]
+        return max(1, int(np.gcd.reduce((stamps - stamps[0]).cpu().numpy()))) if len(stamps) else 1
 
     @cached_property
     def _most_events(self) -> int:

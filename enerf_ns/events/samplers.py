@@ -210,7 +210,8 @@ def rates_around(
     interval in which the pixel was not blind. The rate at the instant is interpolated between both middles, which is
     exact for a signal with a constant second derivative. If the signal turns before the next event, it has nearly come
     to rest, and the rate is half of the rate before. If pixels are blind after an event, the rate is interpolated in
-    this case, too. If a pixel has no event before or after, the other interval alone gives the rate.
+    this case, too. If a pixel has no event before or after, the other interval alone gives the rate. An interval lasts
+    at least as long as a step of the clock, so that equal stamps mean no endless rate.
 
     Args:
         index: The events.
@@ -222,8 +223,8 @@ def rates_around(
     times, positives = index.times, index.positives
     first, last = index.offsets[pixels], index.offsets[pixels + 1] - 1
     before, after = (events - 1).clamp(min=0), (events + 1).clamp(max=len(times) - 1)
-    left, right = (times[events] - times[before] - blind_ns).clamp(min=1), (times[after] - times[events] - blind_ns)
-    left, right = left.double(), right.clamp(min=1).double()
+    left = (times[events] - times[before] - blind_ns).clamp(min=index.resolution).double()
+    right = (times[after] - times[events] - blind_ns).clamp(min=index.resolution).double()
     is_on = torch.stack([positives[events] > positives[before], positives[after] > positives[events]], dim=-1)
     is_on[:, 0] |= (events == 0) & (positives[events] > 0)
     share = (0.5 * left + delay_ns) / (0.5 * left + blind_ns + 0.5 * right)

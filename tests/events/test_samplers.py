@@ -394,6 +394,17 @@ def test_rates_are_exact_where_log_brightness_has_a_constant_second_derivative(r
         assert not other.any()
 
 
+@pytest.mark.parametrize("step", [1_000, 1_000_000])
+def test_rates_of_equal_stamps_are_those_of_a_step_of_the_clock(step: int):
+    """The true rate of 3000 on events a second, whose stamps are whole steps, is never told ten times too large."""
+    stamps = np.arange(0.0, 1e9, 1e9 / 3000).astype(np.int64) // step * step
+    index = index_of({0: [(int(stamp), 1) for stamp in stamps]})
+    assert index.resolution == step
+    events = torch.arange(len(stamps))
+    rates = rates_around(index, events, torch.zeros_like(events), 0, 0)[:, 0]
+    assert rates.min() > 300 and rates.max() < 30_000
+
+
 def test_the_same_seed_draws_the_same_pairs() -> None:
     sampler = EventPairSampler(index_of(recording(False)), "partner")
     one, same, other = (rows(sampler.sample(100, torch.Generator().manual_seed(seed))) for seed in (3, 3, 4))
