@@ -16,15 +16,15 @@ from enerf_ns.dataparsers.scene.depth_range import recording_parallax
 from enerf_ns.dataparsers.sensor_estimates.estimates import median_interval
 from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.refiner import turns_about_two_axes
-from enerf_ns.sensor.lag import LEAST_LAG
+from enerf_ns.sensor.lag import LEAST_LAG, SHARE_IN_THE_DARK, delay_of
 
 LARGEST_NOISE = 0.1
 """Distance (pixels) by which the noise of the poses may move the picture before it is smoothed."""
 
 LARGEST_LAG_MS = 5.0
-"""Largest delay (ms) of the events that is attributed to the lag of the pixels, if that is learned. To first order a
-lag and a wrong clock have the same effect. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the brightness
-that it sees."""
+"""Largest delay (ms) of the events that is attributed to the lag of the photoreceptor, if that is learned. To first
+order a lag and a wrong clock have the same effect. A photoreceptor of 200 Hz lags by 2.3 ms, averaged over the
+brightness that it sees."""
 
 SMALLEST_DELAY, SMALLEST_SCALE = 2.0, 0.06
 """Smallest delay (ms) of a clock, and smallest share of the focal length, that are corrected before training; the
@@ -176,7 +176,7 @@ def _start(scene: Scene, with_clock: bool, with_lens: bool) -> _Start:
             lag = min(delay.value, 0.0)
         if frames is not None and not _is_wrong(frames, 0.0, SMALLEST_DELAY):
             frames = None
-        if scene.value("model.sensor.learn_cutoff_frequency") and -LARGEST_LAG_MS < lag < 0.0:
+        if -_largest_lag(scene) < lag < 0.0:
             start.on_clock.append(f"events are {-lag:.2f} ms late, which is attributed to the lag of the pixels")
             delay = replace(delay, value=delay.value - lag)
             frames = None
@@ -191,6 +191,14 @@ def _start(scene: Scene, with_clock: bool, with_lens: bool) -> _Start:
         start.scale = lens.value
         start.on_lens.append(f"the focal length is {lens.value:.3f} ± {lens.error:.3f} of the stated one")
     return start
+
+
+def _largest_lag(scene: Scene) -> float:
+    """Largest delay (ms) of the events that is attributed to the lag of pixels: of a stated one, that in the dark."""
+    learned = scene.value("model.sensor.learn_cutoff_frequency")
+    stated, second = (scene.value(f"model.sensor.{name}cutoff_frequency") for name in ("", "second_"))
+    largest = LARGEST_LAG_MS if learned else delay_of(stated) / SHARE_IN_THE_DARK
+    return largest + delay_of(second)
 
 
 def _is_wrong(estimate: Estimate, stated: float, smallest: float) -> bool:

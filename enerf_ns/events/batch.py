@@ -30,8 +30,9 @@ class EventBatch:
     starts_at_events: bool = True
     """Whether pairs of events begin at events, after which pixels may be blind. Windows of time do not."""
     rates: Float[Tensor, "pairs 2 2"] | None = None
-    """Events per second around the first and the second instant of each pair, on and off (`samplers.rates_around`).
-    None if the sensor model needs no rates."""
+    """Events per second around the first and the second instant of each pair, on and off: `samplers.rates_around` of
+    events, `samplers.rates_between` of any instants, and 0 of silent pairs, both instants of which lie between the same
+    events. None if the sensor model needs no rates."""
     ahead: Float[Tensor, " pairs"] | None = None
     """Expected change of log brightness beyond the sum of the events, in thresholds, for instants that are no events.
     None: 0."""
@@ -101,7 +102,10 @@ class EventBatch:
         """
         columns = zip(self.columns, others.columns, strict=True)
         joined = (torch.cat(both) for both in columns)
-        rates = None if self.rates is None else torch.cat([self.rates, self.rates.new_zeros(len(others), 2, 2)])
+        rates = None
+        if self.rates is not None:
+            further = self.rates.new_zeros(len(others), 2, 2) if others.rates is None else others.rates
+            rates = torch.cat([self.rates, further])
         ahead = None
         if self.ahead is not None or others.ahead is not None:
             parts = [

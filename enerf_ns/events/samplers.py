@@ -238,6 +238,45 @@ def rates_around(
     return torch.stack([on, of_left + of_right - on], dim=-1).float()
 
 
+def rates_between(
+    index: EventIndex,
+    until: Int64[Tensor, " pairs"],
+    pixels: Int64[Tensor, " pairs"],
+    times: Int64[Tensor, " pairs"],
+    blind_ns: int,
+) -> Float32[Tensor, "pairs 2"]:
+    """Rate of on and off events of a pixel (per second) at any instants.
+
+    As in `rates_around`, an interval between two events holds one event, and has its rate in the middle of the part in
+    which the pixel was not blind. The rate is interpolated between the middle of the interval of an instant and that of
+    the nearer interval beside it, if the pixel has one. Before the first and after the last event the rate is 0.
+
+    Args:
+        index: The events.
+        until: Number of the first event in the index after each instant, or of the first one of the next pixel.
+        pixels: Pixel of each instant.
+        times: The instants, ns.
+        blind_ns: How long a pixel is blind after an event.
+    """
+    first, stop = index.offsets[pixels], index.offsets[pixels + 1]
+
+    def interval(end: Int64[Tensor, " pairs"]) -> tuple[Tensor, Tensor]:
+        """Rates and middle of the interval before an event. Rates are 0 if it is none between events of the pixel."""
+        exists = (end > first) & (end < stop)
+        before, after = (number.clamp(0, len(index.times) - 1) for number in (end - 1, end))
+        length = (index.times[after] - index.times[before] - blind_ns).clamp(min=index.resolution).double()
+        is_on = index.positives[after] > index.positives[before]
+        rates = torch.stack([is_on, ~is_on], dim=-1) * (1e9 / length * exists)[:, None]
+        return rates, index.times[after] - 0.5 * length
+
+    own, middle = interval(until)
+    is_later = times > middle
+    beside, other_middle = interval(torch.where(is_later, until + 1, until - 1))
+    share = ((times - middle) / (other_middle - middle)).nan_to_num(0.0).clamp(0.0, 1.0)
+    share = torch.where(own.any(dim=1) & beside.any(dim=1), share, 0.0)[:, None]
+    return (own * (1.0 - share) + beside * share).float()
+
+
 class HeldOutPairSampler:
     """Draws pairs of events of one pixel that both lie within held-out spans of time.
 
@@ -453,19 +492,20 @@ class InstantPairSampler:
         pixels, one, _, _ = self._moments.draw(batch_size, generator)
         return self._pairs(pixels, *torch.stack([one, self._other(one, generator)]).sort(dim=0)[0])
 
-    def sample_chains(self, batch_size: int, generator: torch.Generator) -> EventBatch:
+    def sample_chains(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
         """Draws `batch_size` pairs, two of them in a chain, as those of `EventPairSampler.sample_chains`: four instants
         of one pixel, in order. One is drawn uniformly, and three near it. Of an odd number, one pair is in no chain.
 
         Args:
             batch_size, generator: As in `sample`.
+            blind_ns: As in `EventPairSampler.sample`; the rates are those of `rates_between`.
         """
         number = batch_size // 2
         pixels, one, _, _ = self._moments.draw(batch_size - number, generator)
         others = [self._other(one[:number], generator) for _ in range(3)]
         chain = torch.stack([one[:number], *others]).sort(dim=0)[0]
         alone = torch.stack([one[number:], self._other(one[number:], generator)]).sort(dim=0)[0]
-        return _batch_of_chains(self._pairs, pixels, chain, alone)
+        return _batch_of_chains(partial(self._pairs, blind_ns=blind_ns), pixels, chain, alone)
 
     def _other(self, one: Int64[Tensor, " pairs"], generator: torch.Generator) -> Int64[Tensor, " pairs"]:
         """Random instants near others, in the time that is used."""
@@ -481,7 +521,11 @@ class InstantPairSampler:
         return torch.where(part % 2 == 0, following[part // 2], other)
 
     def _pairs(
-        self, pixels: Int64[Tensor, " pairs"], start: Int64[Tensor, " pairs"], end: Int64[Tensor, " pairs"]
+        self,
+        pixels: Int64[Tensor, " pairs"],
+        start: Int64[Tensor, " pairs"],
+        end: Int64[Tensor, " pairs"],
+        blind_ns: int | None = None,
     ) -> EventBatch:
         """The pairs of these instants, of which the second is not before the first."""
         begin = self.index.offsets[pixels]
@@ -490,7 +534,17 @@ class InstantPairSampler:
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
         off = until[1] - until[0] - on
-        return EventBatch(pixels, start, end, on, off, num_any=len(pixels), starts_at_events=False, ahead=ahead)
+        rates = None
+        if blind_ns is not None:
+            instants = zip(until, (start, end), strict=True)
+            rates = torch.stack([rates_between(self.index, n, pixels, time, blind_ns) for n, time in instants], dim=1)
+        return EventBatch(
+            *(pixels, start, end, on, off),
+            num_any=len(pixels),
+            starts_at_events=False,
+            rates=rates,
+            ahead=ahead,
+        )
 
     def _is_on(self, until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
         """1 if the last of the first `until` events of the index is an on event, else 0."""

@@ -308,7 +308,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             events = draw(config.event_pairs, self.generator, blind)
             if instants is not None:
                 assert config.instant_pairs is not None
-                events = events.followed_by(instants.sample_chains(config.instant_pairs, self.generator))
+                events = events.followed_by(instants.sample_chains(config.instant_pairs, self.generator, blind))
             if self.silent_sampler is not None:
                 assert config.silent_pairs is not None
                 silent = self.silent_sampler.sample(config.silent_pairs, self.generator, sensor.refractory_period)

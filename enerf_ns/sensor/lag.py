@@ -27,6 +27,9 @@ LEAST_LAG = 0.05
 """Smallest delay of pixels that is worth a lag in the model, as a share of the median interval between the events of a
 pixel: a twentieth of a threshold."""
 
+SHARE_IN_THE_DARK = 20.0 / 275.0
+"""Cut-off frequency of a pixel that sees nothing, as a share of that at brightness 1."""
+
 
 @dataclass
 class LagConfig(ThresholdsConfig):
@@ -59,10 +62,7 @@ class Lag(Thresholds):
 
     def __init__(self, config: LagConfig):
         super().__init__(config)
-        delay, self.second_delay = (
-            1e3 / (2.0 * math.pi * cutoff) if cutoff else 0.0
-            for cutoff in (config.cutoff_frequency, config.second_cutoff_frequency)
-        )
+        delay, self.second_delay = delay_of(config.cutoff_frequency), delay_of(config.second_cutoff_frequency)
         self.delay: Tensor | float = delay
         """Delay (ms) of the photoreceptor at brightness 1."""
         if config.learn_cutoff_frequency:
@@ -98,7 +98,7 @@ class Lag(Thresholds):
         name = "model.sensor.second_cutoff_frequency"
         second = scene.given(name)
         if second:
-            value = f"pixels lag by {1e3 / (2 * math.pi * second):.3g} ms more"
+            value = f"pixels lag by {delay_of(second):.3g} ms more"
             scene.row("second stage", scene.use_events, value, "set by flag", name)
 
     @property
@@ -181,7 +181,7 @@ class Lag(Thresholds):
     ) -> Float[Tensor, "*batch"]:
         """Cut-off frequency of pixels (y * width + x) that see linear brightness, as a share of that at brightness
         1."""
-        return (255.0 * self.brightness(rgb, pixels) + 20.0) / 275.0
+        return SHARE_IN_THE_DARK + (1.0 - SHARE_IN_THE_DARK) * self.brightness(rgb, pixels)
 
     def learned(self) -> dict[str, float]:
         """Values of the sensor that were learned: with `cutoff_frequency`, Hz."""
@@ -189,6 +189,11 @@ class Lag(Thresholds):
         if isinstance(self.delay, Tensor) and self.delay.item() > 0.0:
             found["cutoff_frequency"] = self.cutoff_frequency
         return found
+
+
+def delay_of(cutoff_frequency: float | None) -> float:
+    """Delay (ms) of a low pass of first order with a cut-off frequency (Hz); 0 without one."""
+    return 1e3 / (2.0 * math.pi * cutoff_frequency) if cutoff_frequency else 0.0
 
 
 def delay_error(index: EventIndex) -> float:

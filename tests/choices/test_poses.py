@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 from enerf_ns.choices.poses import noise, selection
+from enerf_ns.choices.resolver import resolve
 from enerf_ns.choices.scene import Scene
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.config import enerf
+from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.event_sensor import SensorSettings
+from enerf_ns.simulator.settings import SimulationSettings
 
 NOISE = 0.03
 """Standard deviation of each coordinate of a position, metres."""
@@ -44,3 +48,19 @@ def test_noise_of_poses_moves_the_picture_by_what_it_is_at_the_distance_of_the_s
     (row,) = scene.choices
     (pixels,) = re.findall(r"^it moves the picture by ([\d.]+) pixels$", row.why)
     assert row.kept and float(pixels) == pytest.approx(simulated.camera.fx * NOISE / distance, rel=0.1)
+
+
+@pytest.mark.parametrize("cutoff", [None, 100.0])
+def test_a_stated_lag_of_pixels_is_no_error_of_a_clock(cutoff: float | None, tmp_path: Path):
+    """Events of a slow sensor are late by milliseconds. If nobody states its lag, poses and frames seem to be early."""
+    sensor = SensorSettings(contrast_thresholds=(0.25, 0.25), cutoff_frequency=100.0)
+    settings = SimulationSettings("shapes", layout="event_recording", width=80, height=60, sensor=sensor)
+    simulate(settings, tmp_path / "slow")
+    config: Any = copy.deepcopy(enerf.config.pipeline)
+    config.model.sensor.learn_cutoff_frequency = False
+    config.model.sensor.cutoff_frequency = cutoff
+    resolution = resolve(config, read_recording(tmp_path / "slow"))
+    (row,) = (choice for choice in resolution.choices if choice.part == "clock of the poses")
+    assert (resolution.values["poses.clock_ms"] == 0.0) == (cutoff is not None)
+    assert ("attributed to the lag of the pixels" in row.why) == (cutoff is not None)
+    assert ("poses are stamped -" in row.why) == (cutoff is None)

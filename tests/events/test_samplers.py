@@ -24,6 +24,7 @@ from enerf_ns.events.samplers import (
     SilentIntervalSampler,
     SilentPixelSampler,
     rates_around,
+    rates_between,
 )
 from enerf_ns.sensor.part import GREY
 from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
@@ -392,6 +393,43 @@ def test_rates_are_exact_where_log_brightness_has_a_constant_second_derivative(r
         expected[-1] = 1e9 / (fired[-1][0] - fired[-2][0] - refractory)
         np.testing.assert_allclose(own, expected, rtol=1e-5)
         assert not other.any()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("refractory", [0, 8_000_000])
+def test_rates_at_any_instants_are_exact_where_log_brightness_has_a_constant_second_derivative(
+    refractory: int, sign: int
+):
+    """Before the middle of the first interval, and after that of the last one, they are those of the interval."""
+    fired = fire(lambda t: sign * (8e-9 * t + 10.0 * (1e-9 * t) ** 2), 1e9, *THRESHOLDS, refractory)
+    index, threshold = index_of({2: fired, 3: [(5, 1), (9, -1)]}), THRESHOLDS[sign < 0]
+    stamps = np.array([time for time, _ in fired])
+    times = np.random.default_rng(0).integers(0, 10**9, 500)
+    pixels = torch.full((500,), 2)
+    until = index.offsets[2] + np.searchsorted(stamps, times, side="right")
+    found = rates_between(index, until, pixels, torch.from_numpy(times), refractory).numpy()
+    middles = stamps[[1, -1]] - 0.5 * (stamps[[1, -1]] - stamps[[0, -2]] - refractory)
+    expected = (8.0 + 20.0 * 1e-9 * times.clip(*middles)) / threshold
+    expected[(times < stamps[0]) | (times >= stamps[-1])] = 0.0
+    np.testing.assert_allclose(found[:, int(sign < 0)], expected, rtol=1e-4)
+    assert not found[:, int(sign > 0)].any() and 0 < np.count_nonzero(expected == 0.0) < 100
+
+
+def test_pairs_of_any_instants_have_the_rates_at_both():
+    index = index_of(recording(False))
+    sampler = InstantPairSampler(index, START, END, 10**6)
+    batch = sampler.sample_chains(301, torch.Generator().manual_seed(0), 0)
+    assert batch.links is not None and batch.links.rates is not None and batch.links.rates.shape == (150, 2, 2)
+    for one in (batch, batch.links):
+        assert one.rates is not None
+        for instant, times in enumerate((one.start, one.end)):
+            until = index.offsets[one.pixels] + index.count_until(one.pixels, times)
+            expected = rates_between(index, until, one.pixels, times, 0)
+            torch.testing.assert_close(one.rates[:, instant], expected, rtol=0, atol=0)
+    events = EventPairSampler(index, "partner").sample(50, torch.Generator().manual_seed(0), 0)
+    joined = events.followed_by(batch).rates
+    assert joined is not None and batch.rates is not None and torch.equal(joined[50:], batch.rates)
+    assert sampler.sample(3, torch.Generator().manual_seed(0)).rates is None
 
 
 @pytest.mark.parametrize("step", [1_000, 1_000_000])
