@@ -490,7 +490,8 @@ class InstantPairSampler:
     def sample(self, batch_size: int, generator: torch.Generator) -> EventBatch:
         """Draws `batch_size` pairs by a generator on the device of the index."""
         pixels, one, _, _ = self._moments.draw(batch_size, generator)
-        return self._pairs(pixels, *torch.stack([one, self._other(one, generator)]).sort(dim=0)[0])
+        start, end = torch.stack([one, self._other(one, generator)]).sort(dim=0)[0]
+        return self._pairs(pixels, start, end)
 
     def sample_chains(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
         """Draws `batch_size` pairs, two of them in a chain, as those of `EventPairSampler.sample_chains`: four instants

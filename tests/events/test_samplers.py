@@ -406,7 +406,7 @@ def test_rates_at_any_instants_are_exact_where_log_brightness_has_a_constant_sec
     stamps = np.array([time for time, _ in fired])
     times = np.random.default_rng(0).integers(0, 10**9, 500)
     pixels = torch.full((500,), 2)
-    until = index.offsets[2] + np.searchsorted(stamps, times, side="right")
+    until = index.offsets[2] + torch.from_numpy(np.searchsorted(stamps, times, side="right"))
     found = rates_between(index, until, pixels, torch.from_numpy(times), refractory).numpy()
     middles = stamps[[1, -1]] - 0.5 * (stamps[[1, -1]] - stamps[[0, -2]] - refractory)
     expected = (8.0 + 20.0 * 1e-9 * times.clip(*middles)) / threshold
