@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.json_values import open_json
@@ -18,7 +16,7 @@ from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import partial_of, write_whole
+from enerf_ns.dataparsers.recording.files import encode_png, partial_of, write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording
 from enerf_ns.dataparsers.recording.time_units import Times, check_units
 
@@ -163,21 +161,18 @@ def _write_frames(file: EventFile, folder: Path, width: int, height: int, senten
             )
         last, name = middle, f"{len(times):05d}.png"
         folder.mkdir(exist_ok=True)
-        colour = frame.pixels[..., ::-1] if frame.pixels.ndim == 3 else frame.pixels
-        encoded = cv2.imencode(".png", colour, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1]
-        (folder / name).write_bytes(encoded.tobytes())
+        (folder / name).write_bytes(encode_png(frame.pixels))
         times[name] = middle
         exposures.append(frame.end - frame.begin)
     if times:
         stamps = [time - file.start for time in times.values()]
         (folder / event_recording.STAMPS_NAME).write_text("".join(f"{stamp}\n" for stamp in stamps))
-        sentences.append(f"{len(times):,} frames are written, with the times of the middle of their exposures.")
+        sentences.append(f"{len(times):,} frames are written.")
     if any(exposures):
         (folder / event_recording.EXPOSURES_NAME).write_text("".join(f"{exposure}\n" for exposure in exposures))
     if num_others:
-        sentences.append(
-            f"{num_others:,} frames are left out, since the sensor has {width} x {height} pixels and they have others."
-        )
+        total, sensor = num_others + len(times), f"sensor's {width} x {height} pixels"
+        sentences.append(f"{num_others:,} of {total:,} frames are left out, since they are not of the {sensor}.")
     return times
 
 

@@ -7,13 +7,12 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Int64, Shaped
 
 from enerf_ns.dataparsers.recording.cache import cache_entry
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
-from enerf_ns.dataparsers.recording.files import load_array, partial_of
+from enerf_ns.dataparsers.recording.files import encode_png, load_array, partial_of
 
 LAYOUT = 1
 """Version of the pictures. It grows when their content changes."""
@@ -65,8 +64,7 @@ def _write(folder: Path, source: Path, name: str, frames: Iterator[tuple[int, np
                     f"{source} holds a frame on {name} at {stamp} ns after one at {stamps[-1]} ns, but frames must be "
                     "in time order; record it again."
                 )
-            encoded = cv2.imencode(".png", pixels[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1]
-            (partial / _file_name(len(stamps))).write_bytes(encoded.tobytes())
+            (partial / _file_name(len(stamps))).write_bytes(encode_png(pixels))
             stamps.append(stamp)
         np.save(partial / STAMPS, np.array(stamps, np.int64))
         try:

@@ -7,13 +7,12 @@ import os
 from dataclasses import fields
 from pathlib import Path
 
-import cv2
 from rich import get_console
 from rich.progress import track
 
 from enerf_ns.dataparsers.recording.cache import cache_entry
 from enerf_ns.dataparsers.recording.errors import OutputError
-from enerf_ns.dataparsers.recording.files import write_whole
+from enerf_ns.dataparsers.recording.files import encode_png, write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of
 from enerf_ns.dataparsers.recording.picture_depth import in_8_bits
 from enerf_ns.dataparsers.recording.recording import Frames
@@ -43,9 +42,8 @@ def write_pictures(frames: Frames) -> list[Path]:
         missing, "Writing undistorted pictures", transient=True, disable=not missing or not get_console().is_terminal
     ):
         picture, state = in_8_bits(frames.picture(i)), file_of(frames.filenames[i]).stat()
-        encoded = cv2.imencode(".png", picture[..., ::-1], (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
         try:
-            write_whole(places[i], encoded)
+            write_whole(places[i], encode_png(picture))
             os.utime(places[i], ns=(state.st_mtime_ns, state.st_mtime_ns))
         except OSError as error:
             raise OutputError(

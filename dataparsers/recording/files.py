@@ -503,6 +503,12 @@ def _mark() -> str:
     return f".partial-{platform.node()}-"
 
 
+def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:
+    """Returns a PNG file of pixels in grey or RGB, uint8 or uint16, packed quickly rather than small."""
+    in_order = pixels[..., ::-1] if pixels.ndim == 3 else pixels  # OpenCV takes BGR
+    return cv2.imencode(".png", in_order, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a file completely, or leaves everything as it was.
 

@@ -162,7 +162,10 @@ def test_frames_of_an_event_file(tmp_path: Path, kind: type, channels: int, caps
         tmp_path / "a.aedat4", tmp_path / "new", poses=tmp_path / "poses.txt", camera=tmp_path / "camera.json"
     ).main()
     printed = " ".join(capsys.readouterr().out.split())
-    assert "7 frames are written" in printed and "1 frames are left out, since the sensor has 24 x 18 pixels" in printed
+    assert (
+        "7 frames are written" in printed
+        and "1 of 8 frames are left out, since they are not of the sensor's 24 x 18 pixels" in printed
+    )
     recording = read_recording(tmp_path / "new")
     assert recording.frames is not None and recording.frames.exposures is not None
     np.testing.assert_array_equal(recording.frames.times, 1000 * (np.array(begins) + 15_000 - rows[0, 0]))
