@@ -94,10 +94,10 @@ RAYS_PER_CHUNK = 1 << (15 if torch.cuda.is_available() else 12)
 """Rays rendered at once: enough to keep a GPU busy, few enough for the cache of a CPU."""
 
 
-def _enerf(name: str, settings: Mapping[str, Any]) -> EnerfTrainerConfig:
+def _enerf(name: str, settings: Mapping[str, Any], defaults: MethodDefaults) -> EnerfTrainerConfig:
     """The method enerf under another name, with changes of settings by the names of ns-train's flags."""
     model = EnerfModelConfig(eval_num_rays_per_chunk=RAYS_PER_CHUNK)
-    pipeline = EnerfPipelineConfig(datamanager=EnerfDataManagerConfig(), model=model)
+    pipeline = EnerfPipelineConfig(datamanager=EnerfDataManagerConfig(), model=model, defaults=defaults)
     for path, value in settings.items():
         section, _, setting = path.removeprefix("pipeline.").rpartition(".")
         setattr(attrgetter(section)(pipeline), setting, value)
@@ -105,12 +105,13 @@ def _enerf(name: str, settings: Mapping[str, Any]) -> EnerfTrainerConfig:
 
 
 def _with_losses(name: str) -> MethodSpecification:
-    losses = PUBLISHED_LOSSES[name]
-    return MethodSpecification(_enerf(name, losses.settings), f"Losses of {losses.source} on the field of enerf.")
+    losses, defaults = PUBLISHED_LOSSES[name], MethodDefaults(refines_poses=False)
+    config = _enerf(name, losses.settings, defaults)
+    return MethodSpecification(config, f"Losses of {losses.source} on the field of enerf.")
 
 
 enerf = MethodSpecification(
-    _enerf("enerf", {}), "E-NeRF: radiance field from an event camera, tuned for error against time."
+    _enerf("enerf", {}, MethodDefaults()), "E-NeRF: radiance field from an event camera, tuned for error against time."
 )
 enerf_paper_loss = _with_losses("enerf-paper-loss")
 enerf_eventnerf = _with_losses("enerf-eventnerf")

@@ -72,6 +72,7 @@ PUBLISHED_LOSSES: dict[str, PublishedLosses] = {
 """Losses by method name, with the values that their authors use for real recordings.
 
 Everything else is that of enerf: field, brightness activation, regularisers, and thresholds, which the authors of the
-last two methods learn. Two parts are missing: the loss of Robust e-NeRF on derivatives in time (weight 0.001), which
-needs second derivatives of the hash grid, and the bandwidth of the pixels in Deblur e-NeRF.
+last two methods learn. Poses are taken as stated, as by the authors. Two parts are missing: the loss of Robust e-NeRF
+on derivatives in time (weight 0.001), which needs second derivatives of the hash grid, and the bandwidth of the pixels
+in Deblur e-NeRF.
 """

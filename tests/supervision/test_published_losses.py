@@ -75,6 +75,8 @@ def test_what_is_said_of_a_method_is_so(name: str, recording: Path):
     assert said["refractory period"].kept == blind == bool(filled.model.sensor.refractory_period_ns)
     assert said["refractory period"].why == ("the recording states it" if blind else "set by the method")
     assert not any(choice.why == "set by flag" for choice in resolution.choices)
+    poses = [said[row] for row in ("clock of the poses", "mount", "lens", "drift of the poses")]
+    assert all(not row.kept and row.why == "not part of the method" for row in poses)
     assert said["silent pixels"].kept == (name == "enerf-deblur")
     if name == "enerf-deblur":
         assert said["silent pixels"].value == "682 pairs a step, between successive events"
@@ -85,7 +87,9 @@ def test_what_is_said_of_a_method_is_so(name: str, recording: Path):
 
     flagged = copy.deepcopy(pipeline)
     flagged.model.sensor.response = "logarithm:0.5"
+    flagged.poses.refine_clock = True
     assert rows(resolve(flagged, stated))["response"].why == "set by flag"
+    assert rows(resolve(flagged, stated))["clock of the poses"].kept
 
 
 @pytest.mark.parametrize("name", PUBLISHED_LOSSES)
