@@ -27,6 +27,7 @@ ONE_INSTANT = {DATA + "exposure_samples": 1}
 """Treats blurred frames as sharp ones."""
 
 POSES_AS_READ = {f"pipeline.poses.refine_{part}": False for part in ("clock", "mount", "lens", "drift")}
+"""Takes clock, mount, lens and trajectory as they are stated."""
 
 PAPER_LOSS = {
     **POSES_AS_READ,
