@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_rates import missed_changes
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.recording.recording import CONTRAST_THRESHOLD_LIMITS, EventRecording
 from enerf_ns.dataparsers.sensor_estimates.frame_contrast import thresholds_from_frames
@@ -200,18 +201,21 @@ def threshold_spread(index: EventIndex, contrast_thresholds: tuple[float, float]
     return Estimate(spread, math.hypot(error / (2 * spread), SPREAD_ERROR * spread), why)
 
 
-def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float]) -> Estimate:
+def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float], completed_ns: int = 0) -> Estimate:
     """Variance that noise adds to a pixel's sum of events with each event, in squared mean thresholds: the part of the
     variance that grows with the number of events, as in a random walk.
 
     Args:
         index: On the CPU.
         contrast_thresholds: C_on and C_off; only their ratio matters.
+        completed_ns: Sums are completed by what pixels missed that were blind for this time after each event
+            (`missed_changes`). Default: they are not.
 
     Returns:
         0 with infinite error if pixels have too few events.
     """
-    growth = _growth(index, contrast_thresholds, with_spread=refractory_period(index) is None)
+    with_spread = not completed_ns and refractory_period(index) is None
+    growth = _growth(index, contrast_thresholds, with_spread, completed_ns)
     if growth is None:
         return Estimate(0.0, math.inf, f"hardly any pixels have {WINDOWS[2]} events")
     why = (
@@ -221,7 +225,9 @@ def noise_per_event(index: EventIndex, contrast_thresholds: tuple[float, float])
     return Estimate(float(growth.values[1]), float(growth.errors[1]), why)
 
 
-def scene_variance(index: EventIndex, contrast_thresholds: tuple[float, float], noise: float) -> float:
+def scene_variance(
+    index: EventIndex, contrast_thresholds: tuple[float, float], noise: float, completed_ns: int = 0
+) -> float:
     """Variance of the log brightness of a scene that a pixel sees, in squared mean thresholds.
 
     It is the largest variance of a pixel's sum of events over any number of them, less the variance that noise adds.
@@ -230,11 +236,12 @@ def scene_variance(index: EventIndex, contrast_thresholds: tuple[float, float], 
         index: On the CPU.
         contrast_thresholds: C_on and C_off; only their ratio matters.
         noise: Variance that noise adds with each event (`noise_per_event`).
+        completed_ns: As in `noise_per_event`.
 
     Returns:
         0 if pixels have too few events.
     """
-    growth = _growth(index, contrast_thresholds, with_spread=False)
+    growth = _growth(index, contrast_thresholds, False, completed_ns)
     return 0.0 if growth is None else max(float((growth.variances - noise * growth.lengths).max()), 0.0)
 
 
@@ -336,14 +343,20 @@ class _Growth:
     """Variance of the sums of each number."""
 
 
-def _growth(index: EventIndex, contrast_thresholds: tuple[float, float], with_spread: bool) -> _Growth | None:
+def _growth(
+    index: EventIndex, contrast_thresholds: tuple[float, float], with_spread: bool, completed_ns: int = 0
+) -> _Growth | None:
     """The growth of the sums of `WINDOWS` events, by a fit to their variance with coefficients of at least 0."""
     on, off = np.array(contrast_thresholds) / np.mean(contrast_thresholds)
+    chosen, pixels = _sampled_events(index)
     times, is_on, follows = _sampled(index)
     pixel = np.concatenate([[0], np.cumsum(~follows)])
     ups = np.concatenate([[0.0], np.cumsum(is_on)])
     numbers = np.arange(len(times) + 1)
     total = on * ups - off * (numbers - ups)
+    if completed_ns:
+        missed = missed_changes(index, chosen, pixels, completed_ns).double().numpy()
+        total[1:] += np.cumsum(on * missed[:, 0] - off * missed[:, 1])
     drift = total[-1] / len(times)
     per_pixel = np.bincount(pixel)
     group = pixel * GROUPS // len(per_pixel)
@@ -388,15 +401,20 @@ def _sampled(
     index: EventIndex,
 ) -> tuple[Int64[np.ndarray, " events"], Bool[np.ndarray, " events"], Bool[np.ndarray, " events-1"]]:
     """Times of the events of some pixels, whether each is an on event, and whether it follows one of its pixel."""
+    chosen, pixels = _sampled_events(index)
+    before = torch.where(chosen > 0, index.positives[(chosen - 1).clamp(min=0)], 0)
+    is_on = (index.positives[chosen] > before).numpy()
+    return index.times[chosen].numpy(), is_on, (pixels[1:] == pixels[:-1]).numpy()
+
+
+def _sampled_events(index: EventIndex) -> tuple[Int64[Tensor, " events"], Int64[Tensor, " events"]]:
+    """Numbers of the events of some pixels in the index, and the pixel of each."""
     step = -(-len(index) // SAMPLED_EVENTS) | 1
     pixels = torch.arange(0, len(index.offsets) - 1, step)
     first, counts = index.offsets[pixels], index.offsets[pixels + 1] - index.offsets[pixels]
     ends = counts.cumsum(0)
     chosen = torch.repeat_interleave(first - ends + counts, counts) + torch.arange(int(ends[-1]))
-    before = torch.where(chosen > 0, index.positives[(chosen - 1).clamp(min=0)], 0)
-    is_on = (index.positives[chosen] > before).numpy()
-    pixel = torch.repeat_interleave(pixels, counts)
-    return index.times[chosen].numpy(), is_on, (pixel[1:] == pixel[:-1]).numpy()
+    return chosen, torch.repeat_interleave(pixels, counts)
 
 
 def _balanced(num_on: Int64[np.ndarray, " sets"], num_off: Int64[np.ndarray, " sets"]) -> Float64[np.ndarray, "2 sets"]:

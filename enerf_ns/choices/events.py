@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from enerf_ns.choices.scene import Scene
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, scene_variance
@@ -29,6 +31,10 @@ MOST_NOISE_BETWEEN, NOISE_OF_SCENE = 1.0, 0.125
 """Largest variance (squared thresholds) that noise may add to the events between any two instants, whose brightness is
 known little better; and the same as a share of the variance of the brightness that a pixel sees, if that is more."""
 
+MOST_NOISE_COMPLETED = 0.4
+"""Largest variance (squared thresholds) that noise may add with each event to sums that are completed by what pixels
+missed. With more, the sums tell less than each event with the next."""
+
 LEAST_APART = 0.1
 """Shortest time (ms) between any two instants. Between closer ones, errors are so small that, balanced by them, these
 pairs would outweigh all others."""
@@ -46,13 +52,33 @@ def held_out_events(scene: Scene) -> None:
     scene.row("held-out events", bool(share), value, why, "datamanager.held_out_events")
 
 
+def missed_changes(scene: Scene) -> None:
+    """Is what pixels missed while they were blind added to the sums of their events?"""
+    name, blind = "datamanager.completed_refractory_ns", scene.once(blind_for)
+    noise = scene.once(_noise_of_completed)
+    kept = bool(scene.use(name, lambda: blind if noise < MOST_NOISE_COMPLETED else 0))
+    if not blind:
+        why = "pixels are not known to be blind after an event"
+    elif not (scene.use_events and scene.defaults.instants):
+        why = "the method does not use them" if scene.use_events else "the field does not learn from events"
+    elif math.isinf(noise):
+        why = "pixels have too few events to tell them"
+    else:
+        why = (
+            f"the rates of events tell them; noise then adds {noise:.2g} squared thresholds an event, "
+            f"{'less' if kept else 'more'} than {MOST_NOISE_COMPLETED:g}"
+        )
+    value = "added to the sums of events" if kept else ""
+    scene.row("missed changes", kept, value, scene.why(name, why), name)
+
+
 def event_pairs(scene: Scene) -> None:
     """Which pairs of events are drawn?"""
-    defaults, blind = scene.defaults, scene.once(blind_for)
-    mode = scene.use("datamanager.pair_mode", lambda: "successor" if blind else "partner")
+    defaults, hidden = scene.defaults, scene.once(hides_changes)
+    mode = scene.use("datamanager.pair_mode", lambda: "successor" if hidden else "partner")
     both = defaults.event_pairs + defaults.silent_pairs
     given = scene.config.datamanager.event_pairs
-    alone = mode == "partner" and defaults.instants and scene.use_events and not scene.use_frames and not blind
+    alone = mode == "partner" and defaults.instants and scene.use_events and not scene.use_frames and not hidden
     alone = alone and scene.config.datamanager.silent_pairs is None
     instants = scene.use("datamanager.instant_pairs", lambda: (given or both // 2) if alone else 0)
     usual = both - both // 2 if instants else defaults.event_pairs
@@ -74,7 +100,7 @@ def event_pairs(scene: Scene) -> None:
     why = "the field learns from events"
     if scene.once(_distance_by_noise) is not None:
         why += f"; their noise adds {scene.once(event_noise):.2g} squared thresholds an event"
-    if blind and mode != "successor":
+    if hidden and mode != "successor":
         why += "; pixels are blind after an event, for which only datamanager.pair-mode successor is exact"
     scene.row("event loss", True, f"{pairs} pairs a step: {values[mode]}", why, "datamanager.supervision")
 
@@ -97,7 +123,7 @@ def any_instants(scene: Scene) -> None:
     if pairs:
         value = f"{pairs} pairs a step, up to {apart:.3g} ms apart, whatever fired between them"
     why = "they constrain what a pixel sees between edges"
-    if scene.once(blind_for):
+    if scene.once(hides_changes):
         why = "pixels that are blind after an event miss changes between their events"
     elif scene.use_frames:
         why = "frames constrain what lies between edges"
@@ -151,9 +177,24 @@ def blind_for(scene: Scene) -> int:
     return scene.once(chosen_refractory_period)[0]
 
 
+def hides_changes(scene: Scene) -> bool:
+    """Whether pixels miss changes while they are blind that are not added to the sums of their events."""
+    return bool(scene.once(blind_for)) and not scene.value("datamanager.completed_refractory_ns")
+
+
 def event_noise(scene: Scene) -> float:
     """Variance (squared mean thresholds) that noise adds to the sum of a pixel's events with each event."""
-    return noise_per_event(scene.index, balanced_thresholds(scene.index)).value
+    completed = scene.value("datamanager.completed_refractory_ns")
+    return noise_per_event(scene.index, balanced_thresholds(scene.index), completed).value
+
+
+def _noise_of_completed(scene: Scene) -> float:
+    """The variance of `event_noise`, of sums that are completed by what pixels missed; infinity if it is unknown."""
+    blind = scene.once(blind_for)
+    if not (blind and scene.use_events and scene.defaults.instants):
+        return math.inf
+    found = noise_per_event(scene.index, balanced_thresholds(scene.index), blind)
+    return found.value if math.isfinite(found.error) else math.inf
 
 
 def _distance_by_noise(scene: Scene) -> int | None:
@@ -175,7 +216,8 @@ def _longest_worth_summing(scene: Scene) -> float:
     index, noise = scene.index, scene.once(event_noise)
     first, last = index.span
     a_pixel = len(index) / max(int((index.offsets.diff() > 0).sum()), 1)
-    variance = scene_variance(index, balanced_thresholds(index), noise)
+    completed = scene.value("datamanager.completed_refractory_ns")
+    variance = scene_variance(index, balanced_thresholds(index), noise, completed)
     most = max(MOST_NOISE_BETWEEN, NOISE_OF_SCENE * variance)
     share = min(max(2.0, most / max(noise, 1e-9)) / a_pixel, 1.0)
     return max(1e-6 * (last - first) * share, 1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from enerf_ns.choices.events import blind_for
+from enerf_ns.choices.events import hides_changes
 from enerf_ns.choices.scene import DATAPARSER, Scene, path_extent
 from enerf_ns.dataparsers.index.indexing import describe_gaps
 from enerf_ns.dataparsers.inspection.agreement import Estimate, clock_of_frames
@@ -13,10 +13,9 @@ from enerf_ns.dataparsers.inspection.agreement import clock_and_lens as sharpest
 from enerf_ns.dataparsers.recording.pose_noise import PoseNoise, pose_noise
 from enerf_ns.dataparsers.recording.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene.depth_range import recording_parallax
-from enerf_ns.dataparsers.sensor_estimates.estimates import median_interval
 from enerf_ns.poses.corrections import Corrections
 from enerf_ns.poses.refiner import turns_about_two_axes
-from enerf_ns.sensor.lag import LEAST_LAG, SHARE_IN_THE_DARK, delay_of
+from enerf_ns.sensor.lag import SHARE_IN_THE_DARK, delay_of
 
 LARGEST_NOISE = 0.1
 """Distance (pixels) by which the noise of the poses may move the picture before it is smoothed."""
@@ -114,7 +113,7 @@ class _Start:
 def clock_and_lens(scene: Scene) -> None:
     """Which errors of clock, mount, lens and drift are corrected, before and during training?"""
     poses, refines = scene.config.poses, scene.defaults.refines_poses and scene.use_events
-    is_blind = scene.use_events and 1e-6 * scene.once(blind_for) > LEAST_LAG * median_interval(scene.index)
+    is_blind = scene.use_events and scene.once(hides_changes)
     stated = {"clock": poses.clock_ms, "lens": poses.focal_scale}
     for part in PARTS:
         fixed = part == "lens" and scene.use_frames  # frames are undistorted once

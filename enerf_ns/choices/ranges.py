@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from enerf_ns.dataparsers.recording import ranges
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.ranges import COUNT, check_range, check_reading
+from enerf_ns.dataparsers.recording.recording import LONGEST_REFRACTORY_PERIOD
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -56,6 +57,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_pair_distance": (1, 10**6),
     "instant_pairs": (0, MOST_DRAWS),
     "instants_apart_ms": (0.0, 1e9),
+    "completed_refractory_ns": (0, LONGEST_REFRACTORY_PERIOD),
     "window_ms": (1e-6, 1e9),  # from 1 ns
     "silent_pairs": (0, MOST_DRAWS),
     "silent_pairs_beside_frames": (0, MOST_DRAWS),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from enerf_ns.choices.events import blind_for
+from enerf_ns.choices.events import hides_changes
 from enerf_ns.choices.extent import depths
 from enerf_ns.choices.poses import corrected_recording
 from enerf_ns.choices.scene import Scene, path_extent
@@ -73,7 +73,7 @@ def edge_start(scene: Scene) -> None:
     kept, why = False, ""
     if scene.use_frames:
         why = "frames show surfaces, too"
-    elif scene.once(blind_for):
+    elif scene.once(hides_changes):
         why = "blind pixels miss edges"
     elif scene.given(name) is None:
         share = scene.once(edge_share)

@@ -23,6 +23,7 @@ ROWS: tuple[Callable[[Scene], None], ...] = (
     frames.split,
     poses.pose_gaps,
     events.held_out_events,
+    events.missed_changes,
     events.event_pairs,
     events.any_instants,
     events.silent_pixels,

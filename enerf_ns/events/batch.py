@@ -11,7 +11,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Pairs: a pixel, two instants, and the number of events that it fired after the first one, up to the second."""
+    """Pairs: a pixel, two instants, and the number of events that it fired after the first one, up to the second, if
+    asked for with the changes that it missed between them while it was blind, in thresholds (`MissedChanges`)."""
 
     pixels: Int64[Tensor, " pairs"]
     """Number of the pixel of each pair, y * width + x."""
@@ -19,9 +20,9 @@ class EventBatch:
     """First instant of each pair, ns. In a pair of events, it is the time of the first event."""
     end: Int64[Tensor, " pairs"]
     """Second instant of each pair, ns. It equals the first one if there was no pair to draw."""
-    on: Int64[Tensor, " pairs"]
+    on: Int64[Tensor, " pairs"] | Float[Tensor, " pairs"]
     """Number of positive events of each pair."""
-    off: Int64[Tensor, " pairs"]
+    off: Int64[Tensor, " pairs"] | Float[Tensor, " pairs"]
     """Number of negative events of each pair."""
     num_silent: int = 0
     """Number of pairs of silent pixels, with two instants between successive events. They come last."""

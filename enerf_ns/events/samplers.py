@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_rates import rates_around, rates_between
 from enerf_ns.events.batch import EventBatch
+from enerf_ns.events.missed_changes import MissedChanges
 
 MOST_DRAWS = 64
 """Largest number of draws for one pair that is kept."""
@@ -35,7 +37,7 @@ class EventPairSampler:
 
     If pixels are blind for a while after each event (`SensorModel.blind_after`), successor pairs are exact. Other pairs
     are approximate: the pixel is also blind after the events between the two, and its changes during that time are
-    missing from the sum of the events.
+    missing from the sum of the events, or known about (`MissedChanges`).
 
     Instants outside `stretches` do not count. The instants before and after a gap are neighbours, and their pair counts
     the events in the gap, so that it is approximate, too. Windows end at gaps.
@@ -48,6 +50,7 @@ class EventPairSampler:
         uniform_over: With "pairs", all pairs are equally likely. With "pixels", all pixels that have a pair are equally
             likely, and so are all pairs of a pixel.
         stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
+        missed: What pixels missed while they were blind, which is then counted with the events. Default: nothing.
 
     Raises:
         ValueError: There is no pair to draw, or an argument is outside its range.
@@ -61,12 +64,13 @@ class EventPairSampler:
         window_ns: int = 60_000_000,
         uniform_over: Literal["pairs", "pixels"] = "pairs",
         stretches: Int64[Tensor, "stretches 2"] | None = None,
+        missed: MissedChanges | None = None,
     ):
         if max_distance < 1 or window_ns < 1:
             raise ValueError(
                 f"Pairs need max_distance and window_ns of at least 1, not {max_distance} and {window_ns}."
             )
-        self.index = index
+        self.index, self.missed = index, missed
         self.window = mode == "window"
         self.max_distance = 1 if mode == "successor" else max_distance
 
@@ -104,9 +108,9 @@ class EventPairSampler:
         """
         pair, pixels = self._draw(batch_size, generator)
         if self.window:
-            return _pairs_of(self.index, pixels, *self._window_pair(pair), blind_ns)
+            return _pairs_of(self.index, pixels, *self._window_pair(pair), blind_ns, self.missed)
         start, end = (self._event(instant) for instant in self._partner_pair(pair, pixels))
-        return _pairs_of(self.index, pixels, start, end, blind_ns)
+        return _pairs_of(self.index, pixels, start, end, blind_ns, self.missed)
 
     def sample_chains(self, batch_size: int, generator: torch.Generator, blind_ns: int | None = None) -> EventBatch:
         """Draws `batch_size` pairs with replacement, two of them in a chain: four events of one pixel, each at most
@@ -171,14 +175,28 @@ class EventPairSampler:
         return instants + torch.searchsorted(self._before_skipped, instants.int(), right=True)
 
 
-def _pairs_of(index: EventIndex, pixels: Tensor, start: Tensor, end: Tensor, blind_ns: int | None) -> EventBatch:
-    """The batch of pairs of events with given numbers in the index, with rates if `blind_ns` is given."""
+def _pairs_of(
+    index: EventIndex,
+    pixels: Tensor,
+    start: Tensor,
+    end: Tensor,
+    blind_ns: int | None,
+    missed: MissedChanges | None = None,
+) -> EventBatch:
+    """The batch of pairs of events with given numbers in the index, with rates if `blind_ns` is given, and with what
+    was missed between them."""
     rates = None
     if blind_ns is not None:
         begins = rates_around(index, start, pixels, blind_ns, blind_ns)
         rates = torch.stack([begins, rates_around(index, end, pixels, 0, blind_ns)], dim=1)
     on = (index.positives[end] - index.positives[start]).long()
-    return EventBatch(pixels, index.times[start], index.times[end], on, end - start - on, rates=rates)
+    changes = _completed(on, end - start - on, missed and missed.between(start, end))
+    return EventBatch(pixels, index.times[start], index.times[end], *changes, rates=rates)
+
+
+def _completed(on: Tensor, off: Tensor, missed: Float32[Tensor, "pairs 2"] | None) -> tuple[Tensor, Tensor]:
+    """Numbers of on and off events, with what was missed."""
+    return (on, off) if missed is None else (on + missed[:, 0], off + missed[:, 1])
 
 
 def _batch_of_chains(
@@ -201,82 +219,6 @@ def _batch_of_chains(
     )
 
 
-def rates_around(
-    index: EventIndex, events: Int64[Tensor, " pairs"], pixels: Int64[Tensor, " pairs"], delay_ns: int, blind_ns: int
-) -> Float32[Tensor, "pairs 2"]:
-    """Rate of on and off events of a pixel (per second), at or shortly after one of its events.
-
-    Each of the two intervals beside the event holds one event. Its rate is the rate in the middle of the part of the
-    interval in which the pixel was not blind. The rate at the instant is interpolated between both middles, which is
-    exact for a signal with a constant second derivative. If the signal turns before the next event, it has nearly come
-    to rest, and the rate is half of the rate before. If pixels are blind after an event, the rate is interpolated in
-    this case, too. If a pixel has no event before or after, the other interval alone gives the rate. An interval lasts
-    at least as long as a step of the clock, so that equal stamps mean no endless rate.
-
-    Args:
-        index: The events.
-        events: Numbers of the events in the index.
-        pixels: Pixel of each event.
-        delay_ns: Time from the event to the instant.
-        blind_ns: How long a pixel is blind after an event.
-    """
-    times, positives = index.times, index.positives
-    first, last = index.offsets[pixels], index.offsets[pixels + 1] - 1
-    before, after = (events - 1).clamp(min=0), (events + 1).clamp(max=len(times) - 1)
-    left = (times[events] - times[before] - blind_ns).clamp(min=index.resolution).double()
-    right = (times[after] - times[events] - blind_ns).clamp(min=index.resolution).double()
-    is_on = torch.stack([positives[events] > positives[before], positives[after] > positives[events]], dim=-1)
-    is_on[:, 0] |= (events == 0) & (positives[events] > 0)
-    share = (0.5 * left + delay_ns) / (0.5 * left + blind_ns + 0.5 * right)
-    share = torch.where(events == last, 0.0, torch.where(events == first, 1.0, share.clamp(max=1.0)))
-    of_left, of_right = 1e9 * (1.0 - share) / left, 1e9 * share / right
-    if not blind_ns:
-        turns = (is_on[:, 0] != is_on[:, 1]) & (events > first) & (events < last)
-        of_left, of_right = torch.where(turns, 0.5e9 / left, of_left), torch.where(turns, 0.0, of_right)
-    of_right, of_left = of_right * (events < last), of_left * (events > first)
-    on = of_left * is_on[:, 0] + of_right * is_on[:, 1]
-    return torch.stack([on, of_left + of_right - on], dim=-1).float()
-
-
-def rates_between(
-    index: EventIndex,
-    until: Int64[Tensor, " pairs"],
-    pixels: Int64[Tensor, " pairs"],
-    times: Int64[Tensor, " pairs"],
-    blind_ns: int,
-) -> Float32[Tensor, "pairs 2"]:
-    """Rate of on and off events of a pixel (per second) at any instants.
-
-    As in `rates_around`, an interval between two events holds one event, and has its rate in the middle of the part in
-    which the pixel was not blind. The rate is interpolated between the middle of the interval of an instant and that of
-    the nearer interval beside it, if the pixel has one. Before the first and after the last event the rate is 0.
-
-    Args:
-        index: The events.
-        until: Number of the first event in the index after each instant, or of the first one of the next pixel.
-        pixels: Pixel of each instant.
-        times: The instants, ns.
-        blind_ns: How long a pixel is blind after an event.
-    """
-    first, stop = index.offsets[pixels], index.offsets[pixels + 1]
-
-    def interval(end: Int64[Tensor, " pairs"]) -> tuple[Tensor, Tensor]:
-        """Rates and middle of the interval before an event. Rates are 0 if it is none between events of the pixel."""
-        exists = (end > first) & (end < stop)
-        before, after = (number.clamp(0, len(index.times) - 1) for number in (end - 1, end))
-        length = (index.times[after] - index.times[before] - blind_ns).clamp(min=index.resolution).double()
-        is_on = index.positives[after] > index.positives[before]
-        rates = torch.stack([is_on, ~is_on], dim=-1) * (1e9 / length * exists)[:, None]
-        return rates, index.times[after] - 0.5 * length
-
-    own, middle = interval(until)
-    is_later = times > middle
-    beside, other_middle = interval(torch.where(is_later, until + 1, until - 1))
-    share = ((times - middle) / (other_middle - middle)).nan_to_num(0.0).clamp(0.0, 1.0)
-    share = torch.where(own.any(dim=1) & beside.any(dim=1), share, 0.0)[:, None]
-    return (own * (1.0 - share) + beside * share).float()
-
-
 class HeldOutPairSampler:
     """Draws pairs of events of one pixel that both lie within held-out spans of time.
 
@@ -287,13 +229,20 @@ class HeldOutPairSampler:
         index: The events. Batches are on its device.
         spans: First and last time (ns) of each held-out span, in order and disjoint.
         max_distance: At least 1.
+        missed: As in `EventPairSampler`.
 
     Raises:
         ValueError: There is no pair to draw.
     """
 
-    def __init__(self, index: EventIndex, spans: Int64[Tensor, "spans 2"], max_distance: int):
-        self.index = index
+    def __init__(
+        self,
+        index: EventIndex,
+        spans: Int64[Tensor, "spans 2"],
+        max_distance: int,
+        missed: MissedChanges | None = None,
+    ):
+        self.index, self.missed = index, missed
         held_out = _places(_last_of_each(index, None, spans)).long()
         pixels = torch.searchsorted(index.offsets, held_out, right=True) - 1
         pairs = [held_out.new_zeros((0, 3))]
@@ -313,7 +262,7 @@ class HeldOutPairSampler:
         """Draws `batch_size` pairs with replacement, with the arguments of `EventPairSampler.sample`."""
         chosen = torch.randint(len(self._pairs), (batch_size,), generator=generator, device=self._pairs.device)
         pixels, start, end = self._pairs[chosen].long().T
-        return _pairs_of(self.index, pixels, start, end, blind_ns)
+        return _pairs_of(self.index, pixels, start, end, blind_ns, self.missed)
 
 
 class SilentPixelSampler:
@@ -460,13 +409,15 @@ class InstantPairSampler:
     A pixel is drawn uniformly over the sensor, without hot pixels, and one instant uniformly over the recording or its
     stretches. The other instant is drawn up to `max_duration_ns` before or after it. Beyond the first or the last
     instant, it is mirrored. Between two stretches, it moves to the beginning of the next stretch; after the last one,
-    to its end. If pixels are blind for a while after an event, changes during that time are missing from the sum.
+    to its end. If pixels are blind for a while after an event, changes during that time are missing from the sum, or
+    known about (`MissedChanges`).
 
     Args:
         index: The events. Batches are on its device.
         start_ns, end_ns: First and last instant that may be drawn.
         max_duration_ns: At least 1.
         stretches: First and last time (ns) of each part of the time that is used, in order and disjoint. Default: all.
+        missed: As in `EventPairSampler`.
 
     Raises:
         ValueError: The duration is shorter than its minimum, or no stretch lies between start and end.
@@ -479,10 +430,11 @@ class InstantPairSampler:
         end_ns: int,
         max_duration_ns: int,
         stretches: Int64[Tensor, "stretches 2"] | None = None,
+        missed: MissedChanges | None = None,
     ):
         if max_duration_ns < 1:
             raise ValueError(f"Pairs of instants need a max_duration_ns of at least 1, not {max_duration_ns}.")
-        self.index = index
+        self.index, self.missed = index, missed
         self.start_ns, self.end_ns = start_ns, end_ns
         self.max_duration_ns = min(max_duration_ns, max(end_ns - start_ns, 1))
         self._moments = _PixelMoments(index, start_ns, end_ns, stretches)
@@ -534,13 +486,14 @@ class InstantPairSampler:
         on = _positives(self.index, until[1]) - _positives(self.index, until[0])
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
-        off = until[1] - until[0] - on
-        rates = None
+        instants, rates, missed = list(zip(until, (start, end), strict=True)), None, None
         if blind_ns is not None:
-            instants = zip(until, (start, end), strict=True)
             rates = torch.stack([rates_between(self.index, n, pixels, time, blind_ns) for n, time in instants], dim=1)
+        if self.missed is not None:
+            before, after = (self.missed.until(pixels, n, time) for n, time in instants)
+            missed = after - before
         return EventBatch(
-            *(pixels, start, end, on, off),
+            *(pixels, start, end, *_completed(on, until[1] - until[0] - on, missed)),
             num_any=len(pixels),
             starts_at_events=False,
             rates=rates,

@@ -31,6 +31,7 @@ from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, ove
 from enerf_ns.dataparsers.scene.depth_range import scene_depth_range
 from enerf_ns.dataparsers.scene.edge_depth import edge_depth
 from enerf_ns.events.batch import EventBatch, FrameBatch, TrainBatch
+from enerf_ns.events.missed_changes import MissedChanges
 from enerf_ns.events.samplers import (
     AccumulationSampler,
     EventPairSampler,
@@ -75,17 +76,20 @@ class EnerfDataManagerConfig(VanillaDataManagerConfig):
     pair_mode: Optional[Literal["successor", "partner", "window", "accumulated"]] = None  # noqa: UP045
     """Second event of a pair: the next event of the pixel (successor), one of its next few (partner), or its last event
     within a window of time (window). Or a window of any length whose events are summed, as in EventNeRF (accumulated).
-    Default: partner; successor where the sensor has a refractory period, in which it misses changes."""
+    Default: partner; successor where the sensor misses changes in a refractory period that events do not tell."""
     max_pair_distance: Optional[int] = None  # noqa: UP045
     """Largest number of events of the pixel from one event of a pair to the other, for pair-mode partner. Default: as
     many as the noise of the events makes useful, at most 10."""
     instant_pairs: Optional[int] = None  # noqa: UP045
     """Pairs of any two instants of a pixel that are drawn at each step; they are compared with the sum of the pixel's
     events between them. Default: half of all pairs, instead of silent pairs, where the field learns from events alone
-    and the sensor has no refractory period; else 0."""
+    and the sensor misses no changes; else 0."""
     instants_apart_ms: Optional[float] = None  # noqa: UP045
     """Longest time between the two instants of a pair of any instants, ms. Default: as long as the noise of the events
     makes useful."""
+    completed_refractory_ns: Optional[int] = None  # noqa: UP045
+    """Time (ns) for which pixels are blind after an event whose changes are added to the sums of events, as the rates
+    of events tell them; 0: they are not added. Default: the refractory period where little noise is left, else 0."""
     window_ms: Optional[float] = None  # noqa: UP045
     """Length of the windows for pair-mode window, and of the longest window for pair-mode accumulated, ms. Default: 60;
     for accumulated, a twentieth of the recording."""
@@ -222,6 +226,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
                 window_ns=window_ns,
                 uniform_over=config.uniform_over,
                 stretches=self._stretches,
+                missed=self._missed,
             )
         except ValueError as error:
             raise FlagError(f"{self.recording.path}: {error}") from error
@@ -233,7 +238,8 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         spans = torch.from_numpy(overlaps(self.recording.stretches, self.held_out_spans)).to(self.device)
         try:
             successors = self.config.pair_mode == "successor"
-            return HeldOutPairSampler(self.index, spans, 1 if successors else self.config.max_pair_distance or 1)
+            distance = 1 if successors else self.config.max_pair_distance or 1
+            return HeldOutPairSampler(self.index, spans, distance, self._missed)
         except ValueError as error:
             return str(error)
 
@@ -256,9 +262,14 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
         if not self.config.instant_pairs:
             return None
         assert self.config.instants_apart_ms is not None
-        return InstantPairSampler(
-            self.index, *self._span, max(1, round(self.config.instants_apart_ms * 1e6)), self._stretches
-        )
+        longest = max(1, round(self.config.instants_apart_ms * 1e6))
+        return InstantPairSampler(self.index, *self._span, longest, self._stretches, self._missed)
+
+    @cached_property
+    def _missed(self) -> MissedChanges | None:
+        """What is added to the sums of events."""
+        period = self.config.completed_refractory_ns
+        return MissedChanges(self.index, period) if period else None
 
     @cached_property
     def event_camera(self) -> PosedCamera:

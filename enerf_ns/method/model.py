@@ -161,7 +161,7 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     edge_start: Optional[bool] = None  # noqa: UP045
     """Start from the depth of edges that events show before training. Default: True with events alone, where more than
-    5 % of the pixels have such an edge and none is blind after an event; for enerf-paper, False."""
+    5 % of the pixels have such an edge and no changes are missed that are not known; for enerf-paper, False."""
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""

@@ -27,6 +27,7 @@ from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 from enerf_ns.method.config import enerf, enerf_paper
 from enerf_ns.sensor.response import Logarithm
+from enerf_ns.simulator.event_sensor import EventSensor, SensorSettings
 
 ENERF: Any = enerf.config.pipeline
 PAPER: Any = enerf_paper.config.pipeline
@@ -213,6 +214,52 @@ def of_unknown_sensor(recording: Path, polarity: np.ndarray) -> EventRecording:
     return replace(
         read_recording(recording), contrast_thresholds=None, response=None, stream_events=lambda: iter([events])
     )
+
+
+def of_blind_sensor(recording: Path, blind_ns: int) -> EventRecording:
+    """Simulated events of all pixels over 80 ms, in which the brightness of each goes up and down by itself; their
+    sensor states its refractory period."""
+    rates = np.random.default_rng(0).uniform(2e-7, 1e-6, (3, HEIGHT, WIDTH))
+
+    def picture(time: int) -> np.ndarray:
+        return np.exp(-1.5 + 0.6 * np.sin(rates * time).sum(axis=0))
+
+    times = np.arange(10_000_000, 90_000_000, 20_000).tolist()
+    sensor = EventSensor(
+        SensorSettings(contrast_thresholds=(0.2, 0.2), refractory_period=blind_ns), picture(times[0]), times[0]
+    )
+    parts = [sensor.advance(picture(time), time) for time in times[1:]] + [sensor.finish()]
+    events = Events(*(np.concatenate([getattr(part, column) for part in parts]) for column in "xytp"))
+    return replace(
+        read_recording(recording),
+        contrast_thresholds=(0.2, 0.2),
+        response="logarithm:0.001",
+        refractory_period=blind_ns,
+        stream_events=lambda: iter([events]),
+    )
+
+
+def test_missed_changes_are_added_where_events_tell_them(recording: Path):
+    """Of brightness with periods of 6 to 31 ms: where pixels are blind for 0.1 ms and for 4 ms."""
+    for blind, kept in ((100_000, True), (4_000_000, False)):
+        scene = of_blind_sensor(recording, blind)
+        resolution = resolve(ENERF, scene)
+        values, row = resolution.values, rows(resolution)["missed changes"]
+        assert values["datamanager.completed_refractory_ns"] == (blind if kept else 0) and row.kept == kept
+        assert values["datamanager.pair_mode"] == ("partner" if kept else "successor")
+        assert bool(values["datamanager.instant_pairs"]) == kept
+        assert (values.get("poses.refine_clock") is False) == (not kept)
+        assert "squared thresholds an event" in row.why
+        exact = resolve(PAPER, scene)
+        assert (
+            exact.values["datamanager.completed_refractory_ns"] == 0 and "method" in rows(exact)["missed changes"].why
+        )
+        config = copy.deepcopy(ENERF)
+        config.datamanager.completed_refractory_ns = 0 if kept else blind
+        forced = resolve(config, scene)
+        assert forced.values["datamanager.pair_mode"] == ("successor" if kept else "partner")
+        assert rows(forced)["missed changes"].why == "set by flag"
+    assert "blind" in rows(resolve(ENERF, read_recording(recording)))["missed changes"].why
 
 
 def test_of_noisy_events_frames_have_more_rays_at_less_cost(recording: Path):
@@ -427,6 +474,7 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
         "event loss": ("events", "frames"),
         "silent pixels": (7, 0),
         "any instants": (7, 0),
+        "missed changes": (1000, 0),
         "threshold per polarity": ((0.2, 0.3), (0.2, 0.2)),
         "threshold map": (True, False),
         "refractory period": (1000, 0),

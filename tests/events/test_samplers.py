@@ -13,9 +13,11 @@ from scipy.optimize import root_scalar
 from scipy.stats import chisquare
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
+from enerf_ns.dataparsers.index.event_rates import missed_changes, rates_around, rates_between
 from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.events import samplers as event_sampler
 from enerf_ns.events.batch import EventBatch
+from enerf_ns.events.missed_changes import MissedChanges
 from enerf_ns.events.samplers import (
     AccumulationSampler,
     EventPairSampler,
@@ -23,8 +25,6 @@ from enerf_ns.events.samplers import (
     InstantPairSampler,
     SilentIntervalSampler,
     SilentPixelSampler,
-    rates_around,
-    rates_between,
 )
 from enerf_ns.sensor.part import GREY
 from enerf_ns.sensor.sensor_model import SensorModel, SensorModelConfig
@@ -829,3 +829,92 @@ def test_any_instants_repeat_with_their_seed_and_leave_hot_pixels_out():
 def test_instants_that_are_no_time_apart_are_refused():
     with pytest.raises(ValueError, match="max_duration_ns"):
         InstantPairSampler(index_of(recording(False)), START, END, 0)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_missed_changes_are_exact_where_log_brightness_has_a_constant_second_derivative(sign: int):
+    """The first and the last event have one interval beside them alone."""
+    refractory, threshold = 8_000_000, THRESHOLDS[sign < 0]
+
+    def signal(time: float) -> float:
+        return sign * (8e-9 * time + 10.0 * (1e-9 * time) ** 2)
+
+    fired = fire(signal, 1e9, *THRESHOLDS, refractory)
+    index = index_of({0: fired})
+    missed = missed_changes(index, torch.arange(len(fired)), torch.zeros(len(fired), dtype=torch.long), refractory)
+    expected = [sign * (signal(time + refractory) - signal(time)) / threshold for time, _ in fired]
+    assert len(fired) > 15 and min(expected) > 0.25
+    own, other = missed[1:-1, int(sign < 0)], missed[1:-1, int(sign > 0)]
+    np.testing.assert_allclose(own, expected[1:-1], rtol=1e-5)
+    assert not other.any()
+
+
+def test_no_more_than_two_thresholds_count_as_missed_at_once():
+    fired = [(0, 1), (1_000_101, 1), (2_000_203, -1), (3_000_307, -1)]
+    events = torch.arange(4)
+    missed = missed_changes(index_of({3: fired}), events, torch.full_like(events, 3), 1_000_000)
+    assert missed.sum(dim=1).tolist() == pytest.approx([2, 2, 2, 2])
+    assert (missed > 0.0).tolist() == [[True, False], [True, True], [False, True], [False, True]]
+
+
+@pytest.mark.parametrize("pixels_at_once", [1, 3, 2**14])
+def test_missed_changes_add_up_over_the_events_of_a_pixel(pixels_at_once: int, monkeypatch, device):
+    monkeypatch.setattr("enerf_ns.events.missed_changes.PIXELS_AT_ONCE", pixels_at_once)
+    pixels, blind = recording(False), 15
+    index = index_of(pixels, device)
+    missed = MissedChanges(index, blind)
+    pixel_of = torch.repeat_interleave(torch.arange(WIDTH * HEIGHT, device=device), index.offsets.diff())
+    single = missed_changes(index, torch.arange(len(index), device=device), pixel_of, blind).cpu().double().numpy()
+    for sampler in (
+        EventPairSampler(index, "partner", 4, missed=missed),
+        EventPairSampler(index, "window", window_ns=WINDOW, missed=missed),
+        HeldOutPairSampler(index, torch.tensor(STRETCHES, device=device), 4, missed),
+        InstantPairSampler(index, START, END, 300, missed=missed),
+    ):
+        batch = sampler.sample(500, torch.Generator(device).manual_seed(0))
+        for pixel, start, end, on, off in zip(*(column.tolist() for column in batch.columns), strict=True):
+            first, own = int(index.offsets[pixel]), pixels[pixel]
+            expected = np.array(
+                [[p > 0 for t, p in own if start < t <= end], [p < 0 for t, p in own if start < t <= end]]
+            )
+            expected = expected.sum(axis=1).astype(float)
+            for number, (t, _) in enumerate(own):
+                if batch.starts_at_events:
+                    share = float(start < t < end)
+                else:
+                    following = [later for later, _ in own[number + 1 :]]
+                    shares = [min(max((time - t) / blind, 0.0), 1.0) for time in (start, end)]
+                    shares = [
+                        float(any(f <= time for f in following)) or s
+                        for s, time in zip(shares, (start, end), strict=True)
+                    ]
+                    share = shares[1] - shares[0]
+                expected += share * single[first + number]
+            assert (on, off) == pytest.approx(tuple(expected), abs=1e-4)
+
+
+@pytest.mark.parametrize("refractory", [1_000_000, 8_000_000])
+def test_sums_with_what_was_missed_are_the_change_of_brightness(refractory: int):
+    """Of pairs of events, and of any instants as exactly as for a pixel that is never blind."""
+
+    def errors(blind: int, completed: bool) -> tuple[float, float]:
+        """Root mean square errors of both kinds of pairs, in mean thresholds."""
+        index = index_of({pixel: fire(signal_of(pixel), 1e9, *THRESHOLDS, blind) for pixel in range(6)})
+        missed = MissedChanges(index, blind) if completed else None
+        found = []
+        for sampler in (
+            EventPairSampler(index, "partner", 10, missed=missed),
+            InstantPairSampler(index, 0, 10**9 - 1, 10**9, missed=missed),
+        ):
+            batch = sampler.sample(4000, torch.Generator().manual_seed(0))
+            batch = batch.subset(batch.pixels < 6)
+            seen = seen_from(batch, blind) if batch.starts_at_events else batch
+            changes = [signal_of(pixel)(end) - signal_of(pixel)(start) for pixel, start, end in rows(seen)]
+            off = sensor_with(blind).measured_change(seen).double().numpy() - changes
+            found.append(float(np.sqrt((off**2).mean()) / np.mean(THRESHOLDS)))
+        return found[0], found[1]
+
+    (of_events, of_any), (_, of_ideal) = errors(refractory, True), errors(0, False)
+    events_without, any_without = errors(refractory, False)
+    assert of_events < 0.12 and of_events < 0.15 * events_without
+    assert of_any < 1.15 * of_ideal < 0.8 and of_any < 0.95 * any_without
