@@ -162,6 +162,7 @@ ROWS: dict[str, Row] = {
     "fixed": Row(FIXED_SENSOR),
     "learned": Row(),
     "known": Row(known_sensor=True),
+    "known-not-completed": Row({DATA + "completed_refractory_ns": 0}, known_sensor=True),
 }
 """Rows by name. Experiments with the same row share its runs."""
 
@@ -223,6 +224,18 @@ SENSORS: dict[str, Sequence] = {
 """Sequences with one fault of the sensor each, and with several. medium and hard have the spreads of thresholds and the
 refractory periods of Robust e-NeRF (Low and Lee, ICCV 2023)."""
 
+
+def _blind(name: str, milliseconds: float) -> dict[str, Sequence]:
+    """A recording of the validation set whose pixels are blind for a while after each event, by its name."""
+    sequence = {**CHOSEN_ON, **ONLY_SCORED}[name]
+    sensor = {"contrast_thresholds": (0.2, 0.2), "refractory_period": round(1e6 * milliseconds)}
+    simulation = {key: value for key, value in sequence.simulation.items() if key != "contrast_thresholds"}
+    return {f"{name}-{milliseconds:g}ms": replace(sequence, sensor=sensor, simulation=simulation)}
+
+
+BLIND_CHOSEN_ON = {**_blind("floor", 0.1), **_blind("relief", 2.0), **_blind("room-hard", 2.0), **_blind("far", 0.5)}
+BLIND_ONLY_SCORED = {**_blind("clutter", 0.2), **_blind("plain", 0.5), **_blind("near", 1.0)}
+
 EV_DEBLUR_BLENDER = ("blurfactory", "bluroutdoorpool", "blurtanabata", "blurwine")
 EV_DEBLUR_CDAVIS = ("blurbatteries", "blurdrones", "blurequipment", "blurfigures", "blurpowersupplies")
 """Scenes in the configs of Ev-DeblurNeRF's authors."""
@@ -247,6 +260,8 @@ SEQUENCES: dict[str, Sequence] = {
         files={"unbounded.json": json.dumps(UNBOUNDED_SCENE), "unbounded.txt": UNBOUNDED_PATH},
     ),
     **SENSORS,
+    **BLIND_CHOSEN_ON,
+    **BLIND_ONLY_SCORED,
     **CHOSEN_ON,
     **ONLY_SCORED,
     "recording": Sequence(),
@@ -580,6 +595,18 @@ EXPERIMENTS: dict[str, Experiment] = {
             "The true value is in brackets. The scale is the factor by which the brightness fit multiplies contrast. "
             "Its true value is the true mean threshold divided by the one that training used.",
             "Columns of maps show the correlation of learned and true thresholds over pixels.",
+        ),
+    ),
+    "refractory": Experiment(
+        "Pixels that are blind after each event: what they missed is added to the sums of events, or is not.",
+        ("known", "known-not-completed"),
+        (*BLIND_CHOSEN_ON, *BLIND_ONLY_SCORED),
+        columns=("psnr", "ssim", "event_correlation", "depth_rmse", "brightness_scale"),
+        measures=("events",),
+        notes=(
+            "The recordings are those of the validation set, with an ideal sensor but for the refractory period in "
+            "their name. Training has all its parameters stated.",
+            f"The limit of noise was chosen on {', '.join(BLIND_CHOSEN_ON)}; the others are only scored.",
         ),
     ),
 }

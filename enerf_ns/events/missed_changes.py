@@ -38,14 +38,14 @@ class MissedChanges:
             total = torch.cat([missed.new_zeros(1, 2), missed.cumsum(0)])
             self.sums[events] = (total[1:] - total[offsets[:-1] - offsets[0]][pixels]).float()
 
-    def between(self, start: Int64[Tensor, " pairs"], end: Int64[Tensor, " pairs"]) -> Float32[Tensor, "pairs 2"]:
-        """Rise and fall that pixels missed between two of their events, from the time on when they are no longer blind
-        after the first one, in thresholds.
+    def seen_again(self, events: Int64[Tensor, " pairs"], until: Int64[Tensor, " pairs"]) -> Int64[Tensor, " pairs"]:
+        """Time (ns) at which pixels see again after events, at least 1 ns before a later event.
 
         Args:
-            start, end: Numbers of the events in the index, of which the second one is later.
+            events: Times of the events, ns.
+            until: Times of the later events, ns.
         """
-        return self.sums[end - 1] - self.sums[start]
+        return events + (until - 1 - events).clamp(max=self.refractory_ns)
 
     def until(
         self, pixels: Int64[Tensor, " pairs"], until: Int64[Tensor, " pairs"], times: Int64[Tensor, " pairs"]

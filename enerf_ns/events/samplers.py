@@ -9,7 +9,7 @@ from functools import partial
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
@@ -120,6 +120,9 @@ class EventPairSampler:
         chain begins with a pair that is drawn as in `sample`. It is moved to an earlier event where the pixel has too
         few later events. Where it has fewer than four events in all, the last one is repeated.
 
+        Where pixels are blind after events, the first event of the last pair counts when its pixel sees again, and the
+        link to it ends then.
+
         Args:
             batch_size, generator, blind_ns: As in `sample`.
 
@@ -137,8 +140,12 @@ class EventPairSampler:
         first, last = self._offsets[pixels[:number]], self._offsets[pixels[:number] + 1] - 1
         chain = torch.minimum(chain - torch.minimum((chain[3] - last).clamp(min=0), chain[0] - first), last)
         alone = torch.stack([start[number:], end[number:]])
-        pairs_of = partial(_pairs_of, self.index, blind_ns=blind_ns)
-        return _batch_of_chains(pairs_of, pixels, self._event(chain), self._event(alone))
+        pairs_of = partial(_pairs_of, self.index, blind_ns=blind_ns, missed=self.missed)
+        chain = self._event(chain)
+        batch = _batch_of_chains(pairs_of, pixels, chain, self._event(alone))
+        if self.missed is None:
+            return batch
+        return replace(batch, links=_links_of(self.index, pixels[:number], chain, blind_ns, self.missed))
 
     def _draw(self, number: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Numbers of random pairs, and their pixels."""
@@ -189,14 +196,46 @@ def _pairs_of(
     if blind_ns is not None:
         begins = rates_around(index, start, pixels, blind_ns, blind_ns)
         rates = torch.stack([begins, rates_around(index, end, pixels, 0, blind_ns)], dim=1)
-    on = (index.positives[end] - index.positives[start]).long()
-    changes = _completed(on, end - start - on, missed and missed.between(start, end))
-    return EventBatch(pixels, index.times[start], index.times[end], *changes, rates=rates)
+    times = index.times[start], index.times[end]
+    seen = times if missed is None else (missed.seen_again(*times), times[1])
+    sums = _sums(index, missed, pixels, (start + 1, end + 1), seen)
+    return EventBatch(pixels, *times, *sums, rates=rates)
 
 
-def _completed(on: Tensor, off: Tensor, missed: Float32[Tensor, "pairs 2"] | None) -> tuple[Tensor, Tensor]:
-    """Numbers of on and off events, with what was missed."""
-    return (on, off) if missed is None else (on + missed[:, 0], off + missed[:, 1])
+def _links_of(
+    index: EventIndex, pixels: Tensor, chains: Int64[Tensor, "4 chains"], blind_ns: int | None, missed: MissedChanges
+) -> EventBatch:
+    """The links of chains of events with given numbers in the index: from the second event to when the pixel sees again
+    after the third one."""
+    start, end, last = chains[1:]
+    rates = None
+    if blind_ns is not None:
+        ends = rates_around(index, end, pixels, blind_ns, blind_ns)
+        rates = torch.stack([rates_around(index, start, pixels, 0, blind_ns), ends], dim=1)
+    times = index.times[start], missed.seen_again(index.times[end], index.times[last])
+    sums = _sums(index, missed, pixels, (start + 1, end + 1), times)
+    return EventBatch(pixels, *times, *sums, starts_at_events=False, rates=rates)
+
+
+def _sums(
+    index: EventIndex,
+    missed: MissedChanges | None,
+    pixels: Tensor,
+    until: tuple[Tensor, Tensor],
+    times: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Number of on and of off events between two instants, with what was missed.
+
+    Args:
+        until: Number of the first event in the index after each instant, or of the first one of the next pixel.
+        times: The instants, ns.
+    """
+    on = _positives(index, until[1]) - _positives(index, until[0])
+    off = until[1] - until[0] - on
+    if missed is None:
+        return on, off
+    before, after = (missed.until(pixels, *instant) for instant in zip(until, times, strict=True))
+    return on + (after - before)[:, 0], off + (after - before)[:, 1]
 
 
 def _batch_of_chains(
@@ -482,18 +521,16 @@ class InstantPairSampler:
     ) -> EventBatch:
         """The pairs of these instants, of which the second is not before the first."""
         begin = self.index.offsets[pixels]
-        until = [begin + self.index.count_until(pixels, time) for time in (start, end)]
-        on = _positives(self.index, until[1]) - _positives(self.index, until[0])
+        first, last = (begin + self.index.count_until(pixels, time) for time in (start, end))
+        until = first, last
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
-        instants, rates, missed = list(zip(until, (start, end), strict=True)), None, None
+        rates = None
         if blind_ns is not None:
+            instants = zip(until, (start, end), strict=True)
             rates = torch.stack([rates_between(self.index, n, pixels, time, blind_ns) for n, time in instants], dim=1)
-        if self.missed is not None:
-            before, after = (self.missed.until(pixels, n, time) for n, time in instants)
-            missed = after - before
         return EventBatch(
-            *(pixels, start, end, *_completed(on, until[1] - until[0] - on, missed)),
+            *(pixels, start, end, *_sums(self.index, self.missed, pixels, until, (start, end))),
             num_any=len(pixels),
             starts_at_events=False,
             rates=rates,

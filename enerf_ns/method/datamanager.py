@@ -314,8 +314,9 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
             pairs, instants = self.pair_sampler, self.instant_sampler
             draw = pairs.sample
             if instants is not None and isinstance(pairs, EventPairSampler) and not pairs.window:
-                # where pixels are blind, a pair begins later after an event than a pair that ends there ends
-                draw = pairs.sample if sensor.refractory_period else pairs.sample_chains
+                # what pixels miss while they are blind lies between a pair's end and the next one's beginning
+                is_known = not sensor.refractory_period or pairs.missed is not None
+                draw = pairs.sample_chains if is_known else pairs.sample
             events = draw(config.event_pairs, self.generator, blind)
             if instants is not None:
                 assert config.instant_pairs is not None

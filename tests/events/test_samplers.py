@@ -873,23 +873,15 @@ def test_missed_changes_add_up_over_the_events_of_a_pixel(pixels_at_once: int, m
     ):
         batch = sampler.sample(500, torch.Generator(device).manual_seed(0))
         for pixel, start, end, on, off in zip(*(column.tolist() for column in batch.columns), strict=True):
-            first, own = int(index.offsets[pixel]), pixels[pixel]
-            expected = np.array(
-                [[p > 0 for t, p in own if start < t <= end], [p < 0 for t, p in own if start < t <= end]]
-            )
-            expected = expected.sum(axis=1).astype(float)
-            for number, (t, _) in enumerate(own):
-                if batch.starts_at_events:
-                    share = float(start < t < end)
-                else:
-                    following = [later for later, _ in own[number + 1 :]]
-                    shares = [min(max((time - t) / blind, 0.0), 1.0) for time in (start, end)]
-                    shares = [
-                        float(any(f <= time for f in following)) or s
-                        for s, time in zip(shares, (start, end), strict=True)
-                    ]
-                    share = shares[1] - shares[0]
-                expected += share * single[first + number]
+            own, of_own = pixels[pixel], single[int(index.offsets[pixel]) :]
+            seen_from = min(start + blind, end - 1) if batch.starts_at_events else start
+            expected = np.zeros(2)
+            for (t, polarity), missed_then in zip(own, of_own, strict=False):
+                expected[int(polarity < 0)] += start < t <= end
+                for sign, until, time in ((-1, start, seen_from), (1, end, end)):
+                    is_last = not any(t < later <= until for later, _ in own)
+                    share = min((time - t) / blind, 1.0) if is_last else 1.0
+                    expected += sign * (t <= until) * share * missed_then
             assert (on, off) == pytest.approx(tuple(expected), abs=1e-4)
 
 
@@ -918,3 +910,24 @@ def test_sums_with_what_was_missed_are_the_change_of_brightness(refractory: int)
     events_without, any_without = errors(refractory, False)
     assert of_events < 0.12 and of_events < 0.15 * events_without
     assert of_any < 1.15 * of_ideal < 0.8 and of_any < 0.95 * any_without
+
+
+@pytest.mark.parametrize("refractory", [1_000_000, 8_000_000])
+def test_links_of_chains_of_blind_pixels_reach_to_when_they_see_again(refractory: int):
+    """All changes between the four instants of a chain, in one order, are that from its first to its last."""
+    index = index_of({pixel: fire(signal_of(pixel), 1e9, *THRESHOLDS, refractory) for pixel in range(6)})
+    sensor = sensor_with(refractory)
+    sampler = EventPairSampler(index, "partner", 4, missed=MissedChanges(index, refractory))
+    batch = sampler.sample_chains(2000, torch.Generator().manual_seed(0), refractory)
+    links, number = batch.links, 1000
+    assert links is not None and len(links) == number and not links.starts_at_events
+    seen = seen_from(batch, refractory)
+    assert torch.equal(links.start, seen.end[:number]) and torch.equal(links.end, seen.start[number:])
+    assert (links.start < links.end).all()
+    for part in (seen, links):
+        changes = [signal_of(pixel)(end) - signal_of(pixel)(start) for pixel, start, end in rows(part)]
+        off = sensor.measured_change(part).double().numpy() - changes
+        assert np.sqrt((off**2).mean()) < 0.15 * np.mean(THRESHOLDS)
+    assert batch.rates is not None and links.rates is not None
+    torch.testing.assert_close(links.rates[:, 0], batch.rates[:number, 1])
+    torch.testing.assert_close(links.rates[:, 1], batch.rates[number:, 0])
