@@ -9,12 +9,12 @@ from torch import Tensor
 from enerf_ns.dataparsers.index.event_index import EventIndex
 from enerf_ns.dataparsers.index.event_rates import missed_changes
 
-PIXELS_AT_ONCE = 2**14
+PIXELS_AT_ONCE = 2**12
 """Pixels whose events are summed at once, which limits memory."""
 
 
 class MissedChanges:
-    """What pixels missed while they were blind (`missed_changes`), in 8 bytes per event.
+    """Changes that pixels missed while they were blind (`missed_changes`), in 8 bytes per event.
 
     The sum of a pixel's events is the change of its brightness, if the pixel is never blind. After each event, a blind
     pixel misses the change until it compares anew. With this change, which the rates of its events show about, the sum

@@ -267,7 +267,7 @@ class EnerfDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def _missed(self) -> MissedChanges | None:
-        """What is added to the sums of events."""
+        """Changes that are added to the sums of events; None if they are not."""
         period = self.config.completed_refractory_ns
         return MissedChanges(self.index, period) if period else None
 

@@ -857,7 +857,7 @@ def test_no_more_than_two_thresholds_count_as_missed_at_once():
     assert (missed > 0.0).tolist() == [[True, False], [True, True], [False, True], [False, True]]
 
 
-@pytest.mark.parametrize("pixels_at_once", [1, 3, 2**14])
+@pytest.mark.parametrize("pixels_at_once", [1, 3, 2**12])
 def test_missed_changes_add_up_over_the_events_of_a_pixel(pixels_at_once: int, monkeypatch, device):
     monkeypatch.setattr("enerf_ns.events.missed_changes.PIXELS_AT_ONCE", pixels_at_once)
     pixels, blind = recording(False), 15
