@@ -261,7 +261,7 @@ def test_one_channel_behind_a_colour_filter_is_refused(recording: EventRecording
 def test_the_refractory_period_reaches_the_rays_and_the_table(recording: EventRecording, mode, approximate: bool):
     blind = replace(recording, refractory_period=8_000_000)
     config = small_config(blind)
-    config.datamanager.pair_mode = mode
+    config.datamanager.pair_mode, config.datamanager.completed_refractory_ns = mode, 0
     rows = {choice.part: choice for choice in resolve(config, blind).choices}
     assert rows["refractory period"].kept and "8 ms" in rows["refractory period"].value
     assert ("successor" in rows["event loss"].why) == approximate

@@ -6,7 +6,7 @@ import math
 
 from enerf_ns.choices.scene import Scene
 from enerf_ns.dataparsers.recording.errors import FlagError
-from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, scene_variance
+from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, scene_variance, share_closer
 from enerf_ns.events.statistics import silent_share
 from enerf_ns.sensor.refractory_period import chosen_refractory_period
 from enerf_ns.sensor.thresholds import balanced_thresholds
@@ -35,6 +35,9 @@ MOST_NOISE_COMPLETED = 0.4
 """Largest variance (squared thresholds) that noise may add with each event to sums that are completed by what pixels
 missed. With more, the sums tell less than each event with the next."""
 
+MOST_CLOSER = 0.01
+"""Largest share of the events that may come while their pixel is blind, if what pixels missed is to be told."""
+
 LEAST_APART = 0.1
 """Shortest time (ms) between any two instants. Between closer ones, errors are so small that, balanced by them, these
 pairs would outweigh all others."""
@@ -62,7 +65,7 @@ def missed_changes(scene: Scene) -> None:
     elif not (scene.use_events and scene.defaults.instants):
         why = "the method does not use them" if scene.use_events else "the field does not learn from events"
     elif math.isinf(noise):
-        why = "pixels have too few events to tell them"
+        why = "the events do not tell them: they are too few, or some come while their pixel is said to be blind"
     else:
         why = (
             f"the rates of events tell them; noise then adds {noise:.2g} squared thresholds an event, "
@@ -189,9 +192,12 @@ def event_noise(scene: Scene) -> float:
 
 
 def _noise_of_completed(scene: Scene) -> float:
-    """The variance of `event_noise`, of sums that are completed by what pixels missed; infinity if it is unknown."""
+    """The variance of `event_noise`, of sums that are completed by what pixels missed; infinity if it is unknown, or if
+    events contradict the refractory period."""
     blind = scene.once(blind_for)
     if not (blind and scene.use_events and scene.defaults.instants):
+        return math.inf
+    if share_closer(scene.index, blind) > MOST_CLOSER:
         return math.inf
     found = noise_per_event(scene.index, balanced_thresholds(scene.index), blind)
     return found.value if math.isfinite(found.error) else math.inf
