@@ -36,7 +36,8 @@ MOST_NOISE_COMPLETED = 0.4
 missed. With more, the sums tell less than each event with the next."""
 
 MOST_CLOSER = 0.01
-"""Largest share of the events that may come while their pixel is blind, if what pixels missed is to be told."""
+"""Largest share of the events that may come while their pixel is blind, if what pixels missed is to be
+identifiable."""
 
 LEAST_APART = 0.1
 """Shortest time (ms) between any two instants. Between closer ones, errors are so small that, balanced by them, these
@@ -65,7 +66,7 @@ def missed_changes(scene: Scene) -> None:
     elif not (scene.use_events and scene.defaults.instants):
         why = "the method does not use them" if scene.use_events else "the field does not learn from events"
     elif math.isinf(noise):
-        why = "the events do not tell them: they are too few, or some come while their pixel is said to be blind"
+        why = "they are not identifiable: events are too few, or some come within the refractory period"
     else:
         why = (
             f"the rates of events tell them; noise then adds {noise:.2g} squared thresholds an event, "

@@ -262,7 +262,7 @@ def test_missed_changes_are_added_where_events_tell_them(recording: Path):
     assert "not known to be blind" in rows(resolve(ENERF, read_recording(recording)))["missed changes"].why
     contradicted = replace(of_blind_sensor(recording, 100_000), refractory_period=2_000_000)
     row = rows(resolve(ENERF, contradicted))["missed changes"]
-    assert not row.kept and "while their pixel is said to be blind" in row.why
+    assert not row.kept and "within the refractory period" in row.why
 
 
 def test_of_noisy_events_frames_have_more_rays_at_less_cost(recording: Path):
