@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from enerf_ns.choices.scene import Scene
+from enerf_ns.dataparsers.inspection.sensor_survey import FASTER_EVENTS
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, scene_variance, share_closer
 from enerf_ns.events.statistics import silent_share
@@ -34,10 +35,6 @@ known little better; and the same as a share of the variance of the brightness t
 MOST_NOISE_COMPLETED = 0.4
 """Largest variance (squared thresholds) that noise may add with each event to sums that are completed by what pixels
 missed. With more, the sums tell less than each event with the next."""
-
-MOST_CLOSER = 0.01
-"""Largest share of the events that may come while their pixel is blind, if what pixels missed is to be
-identifiable."""
 
 LEAST_APART = 0.1
 """Shortest time (ms) between any two instants. Between closer ones, errors are so small that, balanced by them, these
@@ -198,7 +195,7 @@ def _noise_of_completed(scene: Scene) -> float:
     blind = scene.once(blind_for)
     if not (blind and scene.use_events and scene.defaults.instants):
         return math.inf
-    if share_closer(scene.index, blind) > MOST_CLOSER:
+    if share_closer(scene.index, blind) > FASTER_EVENTS:
         return math.inf
     found = noise_per_event(scene.index, balanced_thresholds(scene.index), blind)
     return found.value if math.isfinite(found.error) else math.inf
