@@ -21,8 +21,8 @@ from jaxtyping import Shaped
 
 from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
-from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
 from enerf_ns.dataparsers.recording.files import LONGEST_LINE, check_image_sizes, files_in, image_size, of_file, reading
@@ -62,8 +62,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     frame_files, frame_times = _read_frame_list(folder, notes)
     stamps = {file.name: time for file, time in zip(frame_files, frame_times.tolist(), strict=True)}
     poses_file, unit = (folder / "groundtruth.txt", "s") if poses is None else (poses.path, poses.unit)
-    rows = read_poses(poses_file, unit, notes) if poses is None else poses.rows(stamps, notes)
-    pose_times, positions, quaternions = rows
+    pose_times, positions, quaternions = poses_of(poses_file, unit, poses, stamps, notes)
     first_stamps = [_first_event_time(events_file), pose_times[0], *frame_times[:1]]
     zero = int(min(first_stamps))
     num_bytes = events_file.stat().st_size

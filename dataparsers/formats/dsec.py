@@ -37,8 +37,8 @@ from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in, read_stamps
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectified_camera
 from enerf_ns.dataparsers.formats.json_values import Value
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
-from enerf_ns.dataparsers.formats.text_tables import parse_times, read_poses, read_rows
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
+from enerf_ns.dataparsers.formats.text_tables import parse_times, read_rows
 from enerf_ns.dataparsers.formats.yaml_values import read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -98,12 +98,7 @@ def read(
     files, frame_times, exposures, stamps_file = _read_frames(folder, side)
     stamps = {file.name: time for file, time in zip(files, frame_times.tolist(), strict=True)}
     poses_file, unit = (folder / "poses.txt", "s") if poses is None else (poses.path, poses.unit)
-    if poses is None and not poses_file.exists():
-        raise RecordingError(
-            f"{folder} is of DSEC, which has no poses, and lacks poses.txt with some of yours (t_s px py pz qx qy qz "
-            "qw, left event camera to world); add it, or give poses as --poses of enerf convert."
-        )
-    rows = read_poses(poses_file, unit, notes) if poses is None else poses.rows(stamps, notes)
+    rows = poses_of(poses_file, unit, poses, stamps, notes)
     zero = int(min(events.first_time, rows[0][0], *frame_times[:1]))
     left = Trajectory(rows[0] - zero, *rows[1:])
     trajectory = left if side == "left" else left.of_mounted(left_from_event)

@@ -82,6 +82,9 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             f"{len(exposures)} views; give one of each."
         )
     check_image_sizes(files, camera.width, camera.height)
+    ends = np.minimum(exposures[:, 1], exposures[:, 0] + STEP * (POSES_OF_A_VIEW - 1))
+    durations = ends - exposures[:, 0]
+    middles = exposures[:, 0] + durations // 2
     if poses is None:
         times = (exposures[:, :1] + STEP * np.arange(POSES_OF_A_VIEW)).ravel()
         poses_file, unit, pose_rows = path, "ns", (times, *_poses(path, rows))
@@ -89,18 +92,14 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             "The poses are from COLMAP, so that a unit of length is no metre, and the lens distortion is not known."
         )
     else:
-        stamps = dict(
-            zip((image.name for image in files), exposures.mean(axis=1).astype(np.int64).tolist(), strict=True)
-        )
+        stamps = dict(zip((image.name for image in files), middles.tolist(), strict=True)) if files else {}
         poses_file, unit, pose_rows = poses.path, poses.unit, poses.rows(stamps, notes)
     zero = int(min(file.start, pose_rows[0][0], exposures[0, 0]))
     trajectory = Trajectory(pose_rows[0] - zero, *pose_rows[1:])
     near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
     frames = None
     if files:
-        ends = np.minimum(exposures[:, 1], exposures[:, 0] + STEP * (POSES_OF_A_VIEW - 1))
-        durations = ends - exposures[:, 0]
-        frames = Frames(files, exposures[:, 0] + durations // 2 - zero, camera, trajectory, exposures=durations)
+        frames = Frames(files, middles - zero, camera, trajectory, exposures=durations)
     with of_file(path):
         return EventRecording(
             path=folder,

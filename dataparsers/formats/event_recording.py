@@ -36,8 +36,7 @@ from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_col
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames, read_stamps
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
-from enerf_ns.dataparsers.formats.text_tables import read_poses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
     MOUNTING_KEY,
@@ -88,8 +87,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     about.check_keys(("camera",), OPTIONAL_KEYS)
     camera = parse_camera(about["camera"], folder / "camera_directions.npy")
     poses_file, unit = (folder / "poses.txt", "ns") if poses is None else (poses.path, poses.unit)
-    rows = read_poses(poses_file, unit, notes) if poses is None else poses.rows(_frame_times(folder), notes)
-    trajectory = Trajectory(*rows)
+    trajectory = Trajectory(*poses_of(poses_file, unit, poses, _frame_times(folder) if poses else {}, notes))
     frame_camera, frame_trajectory = camera, trajectory
     if (mounted := about.get("frame_camera")) is not None:
         frame_camera, mounting = _parse_frame_camera(mounted)
@@ -137,12 +135,13 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
         )
 
 
-def write(recording: EventRecording, folder: Path) -> int:
+def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> int:
     """Writes all events, poses, frames, calibration and depth of a recording, with the same times.
 
     Args:
         recording: A recording of any format.
         folder: An empty folder.
+        with_poses: Whether to write poses.txt.
 
     Returns:
         The number of events.
@@ -170,7 +169,8 @@ def write(recording: EventRecording, folder: Path) -> int:
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
     trajectory = recording.trajectory
-    write_poses(folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
+    if with_poses:
+        write_poses(folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
     for name, frames in kinds.items():
         if frames is not None:
             _write_frames(frames, folder / name, folder / "depth")
@@ -179,7 +179,8 @@ def write(recording: EventRecording, folder: Path) -> int:
     num_events, first, last = write_events(
         recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events
     )
-    recording.check_units(num_events, last - first)
+    if with_poses or recording.has_frames:
+        recording.check_units(num_events, last - first)
     return num_events
 
 

@@ -134,7 +134,7 @@ def _find_poses(folder: Path) -> Path:
     if found is None:
         raise RecordingError(
             f"{folder} lacks a file *_pose_gt.h5 or *_depth_gt.h5, which hold the poses; put one there, or give poses "
-            "as --poses of enerf convert."
+            "as --poses of enerf convert, or none yet by its --without-poses."
         )
     return found
 

@@ -167,6 +167,49 @@ class GivenPoses:
         return times, chosen
 
 
+@dataclass(frozen=True)
+class RestPoses(GivenPoses):
+    """Poses of a camera at rest, in place of those of a recording whose poses nobody knows yet."""
+
+    times: tuple[int, ...] = ()
+    """Times that the two poses enclose, beside those of all frames, ns."""
+
+    @property
+    def unit(self) -> str:
+        return "ns"
+
+    def rows(self, frame_times: Mapping[str, int], notes: list[str]) -> PoseRows:
+        times = [*self.times, *frame_times.values()] or [0]
+        ends = np.array([min(times), max(times) + 1])
+        return ends, np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+
+
+def poses_of(
+    path: Path, unit: str, given: GivenPoses | None, frame_times: Mapping[str, int], notes: list[str]
+) -> PoseRows:
+    """Returns the poses of a recording: those that the user gives, or else those of a text file in its folder.
+
+    Args:
+        path: The file, with lines t px py pz qx qy qz qw.
+        unit: Unit of its times.
+        given: Poses in place of the file.
+        frame_times, notes: Arguments of `GivenPoses.rows`.
+
+    Raises:
+        RecordingError: A file is missing, damaged, or holds fewer than two poses.
+        FlagError: `GivenPoses.rows` raises it.
+    """
+    if given is not None:
+        return given.rows(frame_times, notes)
+    if not path.exists():
+        raise RecordingError(
+            f"{path} is missing, a text file with the columns t_{unit} px py pz qx qy qz qw of the event camera; add "
+            "it, or give poses as --poses of enerf convert, which also writes frames --without-poses, so that COLMAP "
+            "can find them."
+        )
+    return read_poses(path, unit, notes)
+
+
 Keys = Int64[np.ndarray, " poses"] | Sequence[str]
 """Times of poses (ns), or the names of their images."""
 Read = tuple[Keys, Float64[np.ndarray, "poses 3"], Float64[np.ndarray, "poses 4"], Order]

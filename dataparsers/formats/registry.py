@@ -36,7 +36,7 @@ from enerf_ns.dataparsers.formats import (
 )
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.json_values import in_words
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, RestPoses
 from enerf_ns.dataparsers.formats.writer import Setup, Writer
 from enerf_ns.dataparsers.recording.cache import cache_folder
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
@@ -187,6 +187,11 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
     if poses is not None:
         if not found.takes_poses:
             whose = ", ".join(format.name for format in formats() if format.takes_poses)
+            if isinstance(poses, RestPoses):
+                raise FlagError(
+                    f"--without-poses is for recordings of {whose}, but {path} is read as {found.name}, with its own "
+                    "poses; leave it out."
+                )
             raise FlagError(
                 f"--poses is for event files and recordings of {whose}, but {path} is read as {found.name}, with its "
                 "own poses; convert it without --poses, and give --poses with the new recording."

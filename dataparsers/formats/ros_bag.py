@@ -52,7 +52,9 @@ FILES = ("*.bag", "*.db3", "*.mcap", "*/*.db3", "*/*.mcap", "metadata.yaml")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
-POSE_FLAGS = PoseFlagNames("--bag-poses", "--bag-tf", ", or give poses as --poses of enerf convert")
+POSE_FLAGS = PoseFlagNames(
+    "--bag-poses", "--bag-tf", ", or give poses as --poses of enerf convert, or none yet by its --without-poses"
+)
 
 LARGEST_DELAY = 10**9
 """Largest time between an event and the stamp of its message, ns, if both are on one clock."""

@@ -14,10 +14,11 @@ from PIL import Image
 from rich.progress import track
 
 from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
+from enerf_ns.dataparsers.formats.pose_files import RestPoses
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import of_file
+from enerf_ns.dataparsers.recording.files import load_array, of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.sensor_estimates.estimates import ASSUMED_THRESHOLD
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
@@ -60,6 +61,9 @@ def reconstruct(
     The reconstructed frames are written as blurred frames, at the times of the sharp frames: training learns from the
     blurred frames, and evaluation uses the sharp frames. All reconstructed frames are scaled to 8 bits alike.
 
+    A recording of the layout event_recording may lack poses.txt, since no pose is looked at. The new one then lacks it,
+    too: structure from motion can find poses of its frames.
+
     Args:
         source: Folder of a recording in any registered format; it is only read.
         output_dir: New or empty folder. After an error it is not there.
@@ -85,7 +89,9 @@ def reconstruct(
             f"--cutoff-frequency is {cutoff_frequency:g}, but must be from 0 to {HIGHEST_CUTOFF_FREQUENCY:g} (Hz)."
         )
     with new_folder(source, output_dir) as folder:
-        recording = read_recording(source, **options)  # type: ignore[arg-type]
+        has_poses = (source / "poses.txt").exists() or not (source / "recording.json").exists()
+        poses = None if has_poses else _poses_at_rest(source)
+        recording = read_recording(source, poses=poses, **options)  # type: ignore[arg-type]
         if recording.bayer_pattern is not None:
             raise RecordingError(
                 f"{source} was recorded by a sensor with the colour filter {recording.bayer_pattern}, but frames are "
@@ -109,12 +115,20 @@ def reconstruct(
             files = _write_frames(shown, (camera.width, camera.height), made)
         frames = Frames(files, times, camera, recording.trajectory, numbers=numbers)
         with_frames = replace(recording, blurred_frames=frames, reconstructed_by=reconstruction.name)
-        sentences = write_recording(with_frames, folder)
+        sentences = write_recording(with_frames, folder, has_poses)
         shutil.rmtree(made)
     if recording.blurred_frames is not None:
         sentences.insert(0, "The blurred frames of the recording are left out.")
     sentences.append(f"{len(times):,} frames are reconstructed by {reconstruction.name}.")
     return sentences
+
+
+def _poses_at_rest(source: Path) -> RestPoses:
+    """Poses of a camera that rests from the first to the last event of a recording of the layout event_recording."""
+    times = load_array(source / "events/t.npy", mmap_mode="r").reshape(-1)
+    if not len(times):
+        raise RecordingError(f"{source} holds no events; give a recording with some.")
+    return RestPoses(source, times=(int(times[0]), int(times[-1])))
 
 
 def _instants(

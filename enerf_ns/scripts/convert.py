@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder, write_recording
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags, RestPoses
 from enerf_ns.dataparsers.inspection.pose_search import mend_poses
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, printable
 from enerf_ns.dataparsers.recording.files import absolute, expanded
@@ -32,6 +32,9 @@ class Convert:
     poses: Path | None = None
     """Poses of the event camera, on the clock of its events: text (TUM), CSV (EuRoC), the folder of a sparse model of
     COLMAP, transforms.json of Nerfstudio, or a ROS bag. Default: those of the recording; an event file has none."""
+    without_poses: bool = False
+    """Write all but the poses of a recording that has none yet, or wrong ones, so that COLMAP can find them for its
+    frames. The poses are added to the new recording by --poses."""
     pose_flags: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
     accept_found: bool = False
     """Search other conventions and another clock of the poses with the events, as enerf inspect does, and write the
@@ -45,6 +48,9 @@ class Convert:
             raise RecordingError(f"{source} does not exist; give the folder of a recording or an event file.")
         chosen, poses = self.options.given(), self._given_poses()
         finish = (lambda folder: mend_poses(folder, output_dir)) if self.accept_found else None
+        if self.without_poses and (poses or self.run or self.accept_found or source.is_file()):
+            reason = "--poses, --run and --accept-found state poses, and an event file has none"
+            raise FlagError(f"--without-poses writes no poses, but {reason}; leave one of both out.")
         if source.is_file():
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"
@@ -58,6 +64,7 @@ class Convert:
             if self.camera is not None:
                 raise FlagError(f"--camera is for event files, but {source} is a folder with its own; leave it out.")
             if self.run is None:
+                poses = RestPoses(source) if self.without_poses else poses
                 sentences = convert_recording(source, output_dir, poses, finish, **chosen)
             else:
                 others = {"poses": self.poses, "accept_found": self.accept_found}
@@ -66,7 +73,7 @@ class Convert:
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
-        if source.is_dir() or (self.poses is not None and self.camera is not None):
+        if (source.is_dir() and not self.without_poses) or (self.poses is not None and self.camera is not None):
             print_next(output_dir)
 
     def _given_poses(self) -> GivenPoses | None:

@@ -19,7 +19,8 @@ class Reconstruct:
     """Reconstruct frames from the events of a recording, and write a recording with these frames to train on."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Folder of a recording in any known format. Nothing is written into it."""
+    """Folder of a recording in any known format. Nothing is written into it. One that enerf convert wrote without poses
+    serves as well."""
     output_dir: Path
     """New folder for the recording. It keeps the original frames for evaluation."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
@@ -35,11 +36,14 @@ class Reconstruct:
     def main(self) -> None:
         source, output_dir = absolute(self.source), absolute(self.output_dir)
         if not source.is_dir():
-            raise RecordingError(f"{source} is not a folder; give that of a recording.")
+            raise RecordingError(
+                f"{source} is not a folder; give that of a recording. An event file is one after enerf convert."
+            )
         weights = self.weights and expanded(self.weights)
         chosen = self.options.given()
         sentences = reconstruct(source, output_dir, weights, self.frames_per_second, self.cutoff_frequency, **chosen)
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
-        print(f"train: ns-train enerf --data {quoted(output_dir)} --pipeline.datamanager.supervision frames")
+        if (output_dir / "poses.txt").exists():
+            print(f"train: ns-train enerf --data {quoted(output_dir)} --pipeline.datamanager.supervision frames")

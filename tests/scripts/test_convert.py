@@ -29,6 +29,7 @@ from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError, U
 from enerf_ns.dataparsers.recording.recording import Events
 from enerf_ns.scripts.convert import Convert
 from enerf_ns.scripts.format_options import format_flags
+from enerf_ns.scripts.reconstruct import Reconstruct
 
 FILE_CAMERA = {**CAMERA, "width": 640, "height": 480}
 
@@ -363,6 +364,12 @@ def test_flags_of_poses_that_cannot_be_followed_are_refused(tmp_path: Path, evt2
     beside_run = Convert(source, new, run=tmp_path / "run", accept_found=True)
     assert refused(tmp_path, beside_run) == "--accept-found is taken from the run of --run; leave it out."
     assert "give --poses and --camera, too" in refused(tmp_path, Convert(evt2_file, new, accept_found=True))
+    own = source / "groundtruth.txt"
+    for others in ({"poses": own}, {"run": tmp_path / "run"}, {"accept_found": True}, {"source": evt2_file}):
+        both = Convert(**{"source": source, "output_dir": new, "without_poses": True, **others})
+        assert refused(tmp_path, both).endswith("leave one of both out.")
+    of_esim = Convert(write_esim(tmp_path / "esim"), new, without_poses=True)
+    assert refused(tmp_path, of_esim).startswith("--without-poses is for recordings of davis, ")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full, the disk that is always full")
@@ -437,6 +444,14 @@ def test_the_command_line(tmp_path: Path):
     write_davis(tmp_path / "davis")
     tyro.cli(Convert, args=[str(tmp_path / "davis"), "--output-dir", str(tmp_path / "new")]).main()
     np.testing.assert_array_equal(all_events(read_recording(tmp_path / "new"))[:, :3], EVENTS[:, :3])
+
+
+def test_without_poses_no_training_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """By both commands, since there is none without poses."""
+    Convert(write_recording(tmp_path / "recording"), tmp_path / "new", without_poses=True).main()
+    Reconstruct(tmp_path / "new", tmp_path / "frames", frames_per_second=4000.0).main()
+    printed = capsys.readouterr().out
+    assert printed.count("Before training, add poses.") == 2 and "ns-train" not in printed
 
 
 def test_poses_of_another_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -1,0 +1,133 @@
+"""Recordings whose poses nobody knows yet: converted, with frames from their events, and with poses at last."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import test_dsec
+import test_m3ed
+import test_ros_bag
+from recordings import write_davis
+from test_event_recording import write_recording
+
+from enerf_ns.dataparsers.formats.conversion import convert_recording
+from enerf_ns.dataparsers.formats.event_recording import write_poses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags, RestPoses
+from enerf_ns.dataparsers.formats.registry import formats, read_recording
+from enerf_ns.dataparsers.recording.errors import RecordingError, UserError
+from enerf_ns.reconstruction.reconstruction import reconstruct
+
+
+def lacking(write: Callable[[Path], object], *files: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        write(folder)
+        for file in files:
+            (folder / file).unlink()
+
+    return make
+
+
+def write_e2nerf(folder: Path) -> None:
+    import test_e2nerf  # here, since it skips where aedat is not installed
+
+    test_e2nerf.write_scene(folder)
+
+
+MADE: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
+    "davis": (write_davis, lacking(write_davis, "groundtruth.txt")),
+    "event_recording": (
+        lambda folder: write_recording(folder, ("frames", "blurred_frames"), depth=True),
+        lacking(lambda folder: write_recording(folder, ("frames", "blurred_frames"), depth=True), "poses.txt"),
+    ),
+    "dsec": (test_dsec.write_dsec, lacking(test_dsec.write_dsec, "poses.txt")),
+    "m3ed": (test_m3ed.write_m3ed, lacking(test_m3ed.write_m3ed, "seq_pose_gt.h5")),
+    "ros_bag": (
+        test_ros_bag.write_bag,
+        lambda folder: test_ros_bag.write_bag(folder, test_ros_bag.Bag(poses_topics=())),
+    ),
+    "e2nerf": (write_e2nerf, write_e2nerf),  # the file of the poses also states the focal length
+}
+"""How to write a recording of each format with poses, and the same without them."""
+
+
+def times_of(folder: Path) -> np.ndarray:
+    """Times of events, then of frames, from the first event on, read from the files of the layout."""
+    events = np.load(folder / "events/t.npy")
+    frames = [np.loadtxt(table, np.int64, ndmin=1) for table in sorted(folder.glob("*/stamps_ns.txt"))]
+    return np.concatenate([events, *frames]) - events[0]
+
+
+def test_all_formats_that_take_poses_are_tried():
+    assert MADE.keys() == {format.name for format in formats() if format.takes_poses}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_all_but_the_poses_are_converted(tmp_path: Path, name: str):
+    """Poses are given to the new recording later, on its own clock."""
+    if name == "e2nerf" and find_spec("aedat") is None:
+        pytest.skip("aedat is an optional extra of the project")
+    whole, without = MADE[name]
+    whole(tmp_path / "whole")
+    without(tmp_path / "without")
+    if whole is not without:
+        with pytest.raises(UserError, match=r"--without-poses"):
+            read_recording(tmp_path / "without")
+    convert_recording(tmp_path / "whole", tmp_path / "true")
+    *_, written, advice = convert_recording(tmp_path / "without", tmp_path / "new", RestPoses(tmp_path / "without"))
+    assert " 0 poses and " in written and advice.startswith("Before training, add poses")
+    assert not (tmp_path / "new/poses.txt").exists()
+    np.testing.assert_array_equal(times_of(tmp_path / "new"), times_of(tmp_path / "true"))
+
+    true = read_recording(tmp_path / "true").trajectory
+    first, true_first = (np.load(tmp_path / f"{folder}/events/t.npy")[0] for folder in ("new", "true"))
+    own = true.times + first - true_first, true.positions, true.quaternions
+    write_poses(tmp_path / "found.txt", *own)
+    given = GivenPoses(tmp_path / "found.txt", PoseFlags(poses_unit="ns"))
+    found = read_recording(tmp_path / "new", poses=given).trajectory
+    np.testing.assert_array_equal(found.times - first, true.times - true_first)
+    np.testing.assert_array_equal(found.positions, true.positions)
+
+
+def test_a_clock_below_zero(tmp_path: Path):
+    """As that of a recording that counts from its trigger; and a recording without frames."""
+    folder = write_recording(tmp_path / "recording")
+    np.save(folder / "events/t.npy", np.load(folder / "events/t.npy") - 10**9)
+    (folder / "poses.txt").unlink()
+    convert_recording(folder, tmp_path / "new", RestPoses(folder))
+    np.testing.assert_array_equal(np.load(tmp_path / "new/events/t.npy"), np.load(folder / "events/t.npy"))
+
+
+@pytest.mark.parametrize("has_frames", [True, False])
+def test_frames_from_events_need_no_poses(recording: Path, tmp_path: Path, has_frames: bool):
+    """They are those of the same recording with poses from the first to the last event."""
+    convert_recording(recording, tmp_path / "with")
+    if not has_frames:
+        for name in ("frames", "blurred_frames", "depth"):
+            shutil.rmtree(tmp_path / "with" / name)
+    times = np.load(tmp_path / "with/events/t.npy")
+    (tmp_path / "with/poses.txt").write_text("".join(f"{times[i]} 0 0 0 0 0 0 1\n" for i in (0, -1)))
+    shutil.copytree(tmp_path / "with", tmp_path / "without")
+    (tmp_path / "without/poses.txt").unlink()
+    made = {name: tmp_path / f"{name}, frames" for name in ("with", "without")}
+    sentences = {name: reconstruct(tmp_path / name, folder) for name, folder in made.items()}
+    assert not (made["without"] / "poses.txt").exists()
+    assert any(sentence.startswith("Before training, add poses") for sentence in sentences["without"])
+
+    own, expected = (sorted((made[name] / "blurred_frames").iterdir()) for name in ("without", "with"))
+    assert [file.name for file in own] == [file.name for file in expected] and len(own) > 2
+    assert [file.read_bytes() for file in own] == [file.read_bytes() for file in expected]
+
+
+def test_no_events(tmp_path: Path):
+    folder = write_recording(tmp_path / "recording")
+    (folder / "poses.txt").unlink()
+    for name in "xytp":
+        np.save(folder / f"events/{name}.npy", np.load(folder / f"events/{name}.npy")[:0])
+    with pytest.raises(RecordingError, match="holds no events"):
+        reconstruct(folder, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
