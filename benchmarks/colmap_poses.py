@@ -40,7 +40,11 @@ def main(camera_file: Path, images: Path, output: Path) -> None:
     )
     pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=NEIGHBOURS))
     calibrated = pycolmap.IncrementalPipelineOptions(
-        ba_refine_focal_length=False, ba_refine_principal_point=False, ba_refine_extra_params=False
+        ba_refine_focal_length=False,
+        ba_refine_principal_point=False,
+        ba_refine_extra_params=False,
+        num_threads=1,  # several threads give another result each time
+        random_seed=0,
     )
     models = pycolmap.incremental_mapping(database, images, output / "sparse", calibrated)
     for number, found in sorted(models.items()):
