@@ -36,9 +36,7 @@ class Reconstruct:
     def main(self) -> None:
         source, output_dir = absolute(self.source), absolute(self.output_dir)
         if not source.is_dir():
-            raise RecordingError(
-                f"{source} is not a folder; give that of a recording. An event file is one after enerf convert."
-            )
+            raise RecordingError(f"{source} is not a folder of a recording; enerf convert makes one of an event file.")
         weights = self.weights and expanded(self.weights)
         chosen = self.options.given()
         sentences = reconstruct(source, output_dir, weights, self.frames_per_second, self.cutoff_frequency, **chosen)
