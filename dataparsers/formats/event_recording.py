@@ -135,13 +135,24 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
         )
 
 
+def event_span(folder: Path) -> tuple[int, int]:
+    """Returns the times (ns) of the first and the last event of a recording of this layout.
+
+    Raises:
+        RecordingError: A file of the events is missing, empty or cannot be used.
+    """
+    ends = _open_columns(folder / "events")["t"][[0, -1]]
+    check_times(folder / "events/t.npy", ends)
+    return int(ends[0]), int(ends[1])
+
+
 def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> int:
     """Writes all events, poses, frames, calibration and depth of a recording, with the same times.
 
     Args:
         recording: A recording of any format.
         folder: An empty folder.
-        with_poses: Whether to write poses.txt.
+        with_poses: Whether to write poses.txt, and to compare its times with those of events and frames.
 
     Returns:
         The number of events.
@@ -179,7 +190,7 @@ def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> i
     num_events, first, last = write_events(
         recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events
     )
-    if with_poses or recording.has_frames:
+    if with_poses:
         recording.check_units(num_events, last - first)
     return num_events
 

@@ -14,11 +14,12 @@ from PIL import Image
 from rich.progress import track
 
 from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
+from enerf_ns.dataparsers.formats.event_recording import event_span
 from enerf_ns.dataparsers.formats.pose_files import RestPoses
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
-from enerf_ns.dataparsers.recording.files import load_array, of_file
+from enerf_ns.dataparsers.recording.files import of_file
 from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.sensor_estimates.estimates import ASSUMED_THRESHOLD
 from enerf_ns.reconstruction.complementary_filter import ComplementaryFilter
@@ -90,7 +91,7 @@ def reconstruct(
         )
     with new_folder(source, output_dir) as folder:
         has_poses = (source / "poses.txt").exists() or not (source / "recording.json").exists()
-        poses = None if has_poses else _poses_at_rest(source)
+        poses = None if has_poses else RestPoses(source, times=event_span(source))
         recording = read_recording(source, poses=poses, **options)  # type: ignore[arg-type]
         if recording.bayer_pattern is not None:
             raise RecordingError(
@@ -121,14 +122,6 @@ def reconstruct(
         sentences.insert(0, "The blurred frames of the recording are left out.")
     sentences.append(f"{len(times):,} frames are reconstructed by {reconstruction.name}.")
     return sentences
-
-
-def _poses_at_rest(source: Path) -> RestPoses:
-    """Poses of a camera that rests from the first to the last event of a recording of the layout event_recording."""
-    times = load_array(source / "events/t.npy", mmap_mode="r").reshape(-1)
-    if not len(times):
-        raise RecordingError(f"{source} holds no events; give a recording with some.")
-    return RestPoses(source, times=(int(times[0]), int(times[-1])))
 
 
 def _instants(

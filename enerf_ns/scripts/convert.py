@@ -48,9 +48,12 @@ class Convert:
             raise RecordingError(f"{source} does not exist; give the folder of a recording or an event file.")
         chosen, poses = self.options.given(), self._given_poses()
         finish = (lambda folder: mend_poses(folder, output_dir)) if self.accept_found else None
-        if self.without_poses and (poses or self.run or self.accept_found or source.is_file()):
-            reason = "--poses, --run and --accept-found state poses, and an event file has none"
-            raise FlagError(f"--without-poses writes no poses, but {reason}; leave one of both out.")
+        if self.without_poses:
+            if source.is_file():
+                raise FlagError(f"--without-poses is for folders of recordings, but {source} is a file; leave it out.")
+            for flag, value in {"--poses": poses, "--run": self.run, "--accept-found": self.accept_found}.items():
+                if value:
+                    raise FlagError(f"--without-poses writes no poses, but {flag} states some; leave one of both out.")
         if source.is_file():
             for option in chosen:
                 flag = f"--{option.replace('_', '-')}"

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -365,9 +366,17 @@ def test_flags_of_poses_that_cannot_be_followed_are_refused(tmp_path: Path, evt2
     assert refused(tmp_path, beside_run) == "--accept-found is taken from the run of --run; leave it out."
     assert "give --poses and --camera, too" in refused(tmp_path, Convert(evt2_file, new, accept_found=True))
     own = source / "groundtruth.txt"
-    for others in ({"poses": own}, {"run": tmp_path / "run"}, {"accept_found": True}, {"source": evt2_file}):
-        both = Convert(**{"source": source, "output_dir": new, "without_poses": True, **others})
-        assert refused(tmp_path, both).endswith("leave one of both out.")
+    both = Convert(source, new, without_poses=True)
+    for flag, other in {
+        "--poses": replace(both, poses=own),
+        "--run": replace(both, run=tmp_path / "run"),
+        "--accept-found": replace(both, accept_found=True),
+    }.items():
+        assert (
+            refused(tmp_path, other)
+            == f"--without-poses writes no poses, but {flag} states some; leave one of both out."
+        )
+    assert "--without-poses is for folders" in refused(tmp_path, Convert(evt2_file, new, without_poses=True))
     of_esim = Convert(write_esim(tmp_path / "esim"), new, without_poses=True)
     assert refused(tmp_path, of_esim).startswith("--without-poses is for recordings of davis, ")
 

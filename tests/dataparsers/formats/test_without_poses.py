@@ -13,6 +13,7 @@ import test_dsec
 import test_m3ed
 import test_ros_bag
 from recordings import write_davis
+from test_bad_input import is_one_sentence
 from test_event_recording import write_recording
 
 from enerf_ns.dataparsers.formats.conversion import convert_recording
@@ -123,11 +124,24 @@ def test_frames_from_events_need_no_poses(recording: Path, tmp_path: Path, has_f
     assert [file.read_bytes() for file in own] == [file.read_bytes() for file in expected]
 
 
-def test_no_events(tmp_path: Path):
+@pytest.mark.parametrize("number", [1, 2])
+def test_few_frames(tmp_path: Path, number: int):
+    """One frame shows no span of time that events could be compared with."""
+    folder = write_davis(tmp_path / "davis")
+    lines = (folder / "images.txt").read_text().splitlines()[:number]
+    (folder / "images.txt").write_text("\n".join(lines))
+    convert_recording(folder, tmp_path / "new", RestPoses(folder))
+    assert len(list((tmp_path / "new/frames").glob("*.png"))) == number
+
+
+@pytest.mark.parametrize(
+    "times", [np.zeros(0, np.int64), np.full(6, np.nan), np.full(6, 2**64 - 1, np.uint64), np.array(3)]
+)
+def test_times_that_cannot_be(tmp_path: Path, times: np.ndarray):
     folder = write_recording(tmp_path / "recording")
     (folder / "poses.txt").unlink()
-    for name in "xytp":
-        np.save(folder / f"events/{name}.npy", np.load(folder / f"events/{name}.npy")[:0])
-    with pytest.raises(RecordingError, match="holds no events"):
+    np.save(folder / "events/t.npy", times)
+    with pytest.raises(RecordingError) as error:
         reconstruct(folder, tmp_path / "new")
+    assert is_one_sentence(f"enerf: {error.value}") and "events" in str(error.value)
     assert not (tmp_path / "new").exists()
