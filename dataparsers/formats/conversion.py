@@ -12,7 +12,7 @@ from typing import Any
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.json_values import open_json
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, RestPoses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
@@ -46,21 +46,21 @@ def convert_recording(
     """
     with new_folder(source, output_dir) as folder:
         recording = read_recording(source, poses=poses, **options)  # type: ignore[arg-type]
-        sentences = write_recording(recording, folder, not isinstance(poses, RestPoses))
+        sentences = write_recording(recording, folder)
         return sentences + (finish(folder) if finish else [])
 
 
-def write_recording(recording: EventRecording, folder: Path, with_poses: bool = True) -> list[str]:
+def write_recording(recording: EventRecording, folder: Path) -> list[str]:
     """Writes a recording as `event_recording.write` does.
 
     Args:
-        recording, folder, with_poses: As there.
+        recording, folder: As there.
 
     Returns:
         Sentences that state what was written and what was left out.
     """
-    num_events = event_recording.write(recording, folder, with_poses)
-    num_poses = len(recording.trajectory.times) if with_poses else 0
+    num_events = event_recording.write(recording, folder)
+    num_poses = len(recording.trajectory.times) if recording.has_poses else 0
     num_frames = sum(len(frames.times) for frames in (recording.frames, recording.blurred_frames) if frames)
     sentences = [
         *recording.notes,
@@ -72,7 +72,7 @@ def write_recording(recording: EventRecording, folder: Path, with_poses: bool = 
     if recording.depth_maps is not None:
         maps = len(recording.depth_maps.times)
         sentences.insert(0, f"{maps:,} depth maps are left out, since the layout holds those at the times of frames.")
-    if not with_poses:
+    if not recording.has_poses:
         sentences.append(
             "Before training, add poses. docs/tutorial-poses.md shows how COLMAP finds them for frames, and how "
             "`enerf convert` adds them to the new recording."

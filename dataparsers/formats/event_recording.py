@@ -36,7 +36,7 @@ from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_col
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import read_frames, read_stamps
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, RestPoses, poses_of
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
     MOUNTING_KEY,
@@ -135,24 +135,26 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
         )
 
 
-def event_span(folder: Path) -> tuple[int, int]:
-    """Returns the times (ns) of the first and the last event of a recording of this layout.
+def rest_poses(folder: Path) -> RestPoses | None:
+    """Returns poses at rest from the first to the last event of a recording of this layout that has no poses; None for
+    any other folder.
 
     Raises:
         RecordingError: A file of the events is missing, empty or cannot be used.
     """
+    if (folder / "poses.txt").exists() or not (folder / "recording.json").exists():
+        return None
     ends = _open_columns(folder / "events")["t"][[0, -1]]
     check_times(folder / "events/t.npy", ends)
-    return int(ends[0]), int(ends[1])
+    return RestPoses(folder, times=(int(ends[0]), int(ends[1])))
 
 
-def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> int:
+def write(recording: EventRecording, folder: Path) -> int:
     """Writes all events, poses, frames, calibration and depth of a recording, with the same times.
 
     Args:
-        recording: A recording of any format.
+        recording: A recording of any format. Without poses, poses.txt is not written, and no times are compared.
         folder: An empty folder.
-        with_poses: Whether to write poses.txt, and to compare its times with those of events and frames.
 
     Returns:
         The number of events.
@@ -180,7 +182,7 @@ def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> i
     if recording.camera.directions is not None:
         np.save(folder / "camera_directions.npy", recording.camera.directions)
     trajectory = recording.trajectory
-    if with_poses:
+    if recording.has_poses:
         write_poses(folder / "poses.txt", trajectory.times, trajectory.positions, trajectory.quaternions)
     for name, frames in kinds.items():
         if frames is not None:
@@ -190,7 +192,7 @@ def write(recording: EventRecording, folder: Path, with_poses: bool = True) -> i
     num_events, first, last = write_events(
         recording.stream_events(), folder / "events", *size, recording.locate, recording.num_events
     )
-    if with_poses:
+    if recording.has_poses:
         recording.check_units(num_events, last - first)
     return num_events
 

@@ -202,7 +202,8 @@ def _read_folder(path: Path, format: str, poses: GivenPoses | None = None, **opt
     name_links_out(path)
     try:
         with of_file(path):
-            return replace(found.read(path, **options), read_with=read_with)
+            has_poses = not isinstance(poses, RestPoses)
+            return replace(found.read(path, **options), read_with=read_with, has_poses=has_poses)
     except OSError as error:  # as of a name that is longer than names can be
         raise RecordingError(
             f"{path} names ...{os.fsdecode(error.filename or path)[-NAME_SHOWN:]}, which cannot be opened "

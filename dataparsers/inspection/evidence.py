@@ -61,7 +61,7 @@ class Evidence:
     @classmethod
     def of(cls, recording: EventRecording) -> Evidence:
         """Compares cameras, depth range, frames and depth maps with the events. Takes a second, and with depth maps
-        some seconds.
+        some seconds. Without poses, depths are not compared.
 
         Args:
             recording: Its index is made if it is not there yet.
@@ -69,11 +69,14 @@ class Evidence:
         Raises:
             RecordingError: The events or a frame cannot be used.
         """
-        found, parallax = cls(), recording_parallax(recording)
-        found.problems += [*_camera_problems(recording), *_range_problems(recording, parallax)]
+        parallax = recording_parallax(recording) if recording.has_poses else None
+        found = cls([*_camera_problems(recording)])
+        if parallax is not None:
+            found.problems += _range_problems(recording, parallax)
         shown = [*_level_problems(recording)]
         found.problems += shown
-        found._add(_depth_maps(recording, parallax))
+        if parallax is not None:
+            found._add(_depth_maps(recording, parallax))
         found._add(_polarity(recording, parallax, "the frames show nothing" if shown else ""))
         return found
 
@@ -146,12 +149,12 @@ def _level_problems(recording: EventRecording) -> Iterator[Problem]:
             yield Problem(f"The {name} {what}.", advice)
 
 
-def _polarity(recording: EventRecording, parallax: Parallax, no_frames: str) -> Problem | OpenQuestion | None:
+def _polarity(recording: EventRecording, parallax: Parallax | None, no_frames: str) -> Problem | OpenQuestion | None:
     question = "whether on and off events are exchanged, and whether events and frames are mirrored"
     frames = recording.camera_frames
     if frames is None or no_frames:
         return OpenQuestion(question, no_frames or "there are no frames")
-    depths = recording.depth_range or (parallax.depth_range if parallax.is_shown else (1.0, 1.0))
+    depths = recording.depth_range or (parallax.depth_range if parallax and parallax.is_shown else (1.0, 1.0))
     changes = FrameChanges.of(recording, frames, float(np.sqrt(depths[0] * depths[1])))
     value = f"{changes.correlation:.2f} ± {changes.error:.2f}"
     if changes.num_pairs < FEWEST_PAIRS:

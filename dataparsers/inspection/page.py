@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.index.event_index import event_picture
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.agreement import (
+    FITS,
     HARMFUL_SHIFT,
     MILLISECOND,
     SHOWN_DELAYS,
@@ -123,13 +124,13 @@ class Inspection:
     recording: EventRecording
     statistics: EventStatistics
     depth_range: tuple[float, float] | None
-    """Nearest and farthest depth of the scene, metres. None if it is neither stated nor measurable, or if the camera
-    only turns."""
+    """Nearest and farthest depth of the scene, metres. None if it is neither stated nor measurable, if the camera only
+    turns, or without poses."""
     problems: list[Problem]
     sensor: SensorSurvey
     """Sensor parameters, stated and measured."""
     agreement: Agreement | None = None
-    """Agreement of clocks, poses and focal length with the events. None if there are too few events."""
+    """Agreement of clocks, poses and focal length with the events. None if there are too few events, or no poses."""
     as_stated: Agreement | None = None
     """The same with the clocks, poses and focal length as stated. None unless a training refined them."""
     unknown: tuple[OpenQuestion, ...] = ()
@@ -139,16 +140,24 @@ class Inspection:
     def of(cls, recording: EventRecording) -> Inspection:
         """Counts events, looks for problems, measures sensor and depth, compares events with poses and frames.
 
+        Without poses, depth is not measured, and events are compared with frames alone.
+
         Raises:
             RecordingError: The events or a frame cannot be used.
         """
         statistics = event_statistics(recording)
+        sensor = SensorSurvey.of(recording)
+        if not recording.has_poses:
+            evidence = Evidence.of(recording)
+            problems = [*evidence.problems, *sensor.problems(), *find_problems(recording, None, statistics)]
+            questions = OpenQuestion(FITS, "there are no poses yet"), *evidence.unknown
+            return cls(recording, statistics, None, problems, sensor, unknown=questions)
         near_far, unknown = None, []
         try:
             near_far = scene_depth_range(recording)
         except UnknownDepthError as error:
             unknown = [f"The depth range of the scene cannot be measured, because {error.reason}."]
-        agreement, sensor = Agreement.of(recording, near_far), SensorSurvey.of(recording)
+        agreement = Agreement.of(recording, near_far)
         shown = None if recording_parallax(recording).is_ruled_out else near_far
         contradictions = agreement.problems() if agreement else []
         evidence = Evidence.of(recording)
@@ -192,10 +201,11 @@ class Inspection:
         recording, (first, *_, last) = self.recording, self.statistics.edges
         times = recording.trajectory.times
         interval = float(np.median(np.diff(times))) * 1e-9
+        poses = f"{len(times):,}, {_span(times[0], times[-1])}, usually every {1e3 * interval:.3g} ms"
         rows = {
             "format": recording.format,
             "events": f"{self.statistics.num_events:,}, {_span(first, last)}",
-            "poses": f"{len(times):,}, {_span(times[0], times[-1])}, usually every {1e3 * interval:.3g} ms",
+            "poses": poses if recording.has_poses else "none yet",
         }
         for name, frames in {"frames": recording.frames, "blurred frames": recording.blurred_frames}.items():
             rows[name] = "none"
@@ -215,14 +225,12 @@ class Inspection:
     def numbers(self) -> dict[str, str]:
         """Counts and measurements in words, by name."""
         recording, statistics = self.recording, self.statistics
-        gaps = pose_gaps(recording, statistics)
-        missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
-        path = self._path(1000)[1][:, :, 3]
         hot = index_events(recording).hot_pixels.numpy()
         width = recording.camera.width
         places = ", ".join(f"({pixel % width}, {pixel // width})" for pixel in hot[:NAMED_HOT_PIXELS])
         more = f" and {len(hot) - NAMED_HOT_PIXELS} more" if len(hot) > NAMED_HOT_PIXELS else ""
-        rows = {
+        rows = self._numbers_of_motion() if recording.has_poses else {}
+        return {
             "event rate": f"{_round(statistics.num_events / statistics.seconds)} per second on average, "
             f"{_round(statistics.rate.max())} at most",
             "per pixel": f"{statistics.events_per_pixel:.3g} events; "
@@ -230,6 +238,16 @@ class Inspection:
             "polarity": f"{100 * statistics.num_on / statistics.num_events:.1f} % on, "
             f"{100 * statistics.num_off / statistics.num_events:.1f} % off",
             "hot pixels": f"{len(hot):,} left out, (x, y) = {places}{more}" if len(hot) else "none left out",
+            **rows,
+        }
+
+    def _numbers_of_motion(self) -> dict[str, str]:
+        """Measurements of trajectory and scene in words, by name."""
+        recording, statistics = self.recording, self.statistics
+        gaps = pose_gaps(recording, statistics)
+        missing = float(np.diff(gaps).sum()) * 1e-9 / statistics.seconds
+        path = self._path(1000)[1][:, :, 3]
+        rows = {
             "pose coverage": f"{100 * (1 - missing):.3g} % of the time with events"
             + (f", {len(gaps)} gap{'s' * (len(gaps) > 1)}" if len(gaps) else ", no gaps"),
             "path": f"{np.nansum(np.linalg.norm(np.diff(path, axis=0), axis=1)):.3g} m long, "
@@ -289,7 +307,7 @@ class Inspection:
             corrections=_plot(corrections) if corrections else None,
             timeline=_plot(self.timeline()),
             instants=self._instants(),
-            trajectory=_plot(self.trajectory()),
+            trajectory=_plot(self.trajectory()) if self.recording.has_poses else None,
             heat_map=_plot(self.heat_map()),
         )
 
@@ -305,12 +323,15 @@ class Inspection:
         frames = self._frames
         if frames is not None:
             coverage.vlines(frames.times * 1e-9, 0.72, 1.28, color=GREEN, linewidth=0.8)
+        middle, poses = 0.5 * (edges[0] + edges[-1]), recording.trajectory
+        if frames is None:
+            coverage.text(middle, 1, "no frames", color=GREY, ha="center", va="center")
+        if recording.has_poses:
+            coverage.barh(0, (poses.end - poses.start) * 1e-9, left=poses.start * 1e-9, height=0.55, color=GREY)
+            for begin, end in pose_gaps(recording, statistics) * 1e-9:
+                coverage.barh(0, end - begin, left=begin, height=0.55, color=RED)
         else:
-            coverage.text(0.5 * (edges[0] + edges[-1]), 1, "no frames", color=GREY, ha="center", va="center")
-        poses = recording.trajectory
-        coverage.barh(0, (poses.end - poses.start) * 1e-9, left=poses.start * 1e-9, height=0.55, color=GREY)
-        for begin, end in pose_gaps(recording, statistics) * 1e-9:
-            coverage.barh(0, end - begin, left=begin, height=0.55, color=RED)
+            coverage.text(middle, 0, "no poses yet", color=GREY, ha="center", va="center")
         coverage.set_yticks([0, 1, 2], ["poses", "frames", "events"])
         coverage.set_ylim(-0.5, 2.5)
         coverage.tick_params(axis="both", length=0)
@@ -318,7 +339,9 @@ class Inspection:
 
         rate.stairs(statistics.rate / 1e6, edges, fill=True, color=BLUE, alpha=0.35)
         rate.stairs(statistics.rate / 1e6, edges, color=BLUE, linewidth=0.8, baseline=None)
-        silences, bursts = unusual_rates(recording, statistics, self.depth_range)
+        silences = bursts = np.zeros((0, 2))
+        if recording.has_poses:
+            silences, bursts = unusual_rates(recording, statistics, self.depth_range)
         for begin, end in np.concatenate([silences, bursts]) * 1e-9:
             rate.axvspan(begin, end, color=RED, alpha=0.35)
         calm = ~((statistics.edges[:-1, None] >= bursts[:, 0]) & (statistics.edges[:-1, None] < bursts[:, 1])).any(1)

@@ -198,6 +198,8 @@ def find_problems(
 ) -> list[Problem]:
     """Problems of a recording, with advice. Takes seconds once the events are indexed.
 
+    Without poses, only events and frames are looked at.
+
     Args:
         recording: Its index is made if it is not there yet.
         depth_range: Nearest and farthest depth, metres. Default: the range that the recording states, if any.
@@ -207,23 +209,31 @@ def find_problems(
         RecordingError: The events cannot be used.
     """
     statistics = statistics or event_statistics(recording, SAMPLED_EVENTS)
-    depth_range = depth_range or recording.depth_range
-    gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
-    swings = pose_swings(recording, statistics, depth_range, jumps)
-    silences, bursts = unusual_rates(recording, statistics, depth_range)
-    flag = _time_range_without(np.concatenate([gaps, jumps, swings, silences, bursts]), statistics)
     return [
         *_unfinished(recording.path),
-        *_left_out({**recording.shares_outside_poses, "events": index_events(recording).share_outside_poses}),
-        *_pose_problems(recording, statistics, gaps, jumps, swings, flag),
-        *_distance_problems(recording, statistics, depth_range),
-        *_rate_problems(silences, bursts, flag),
+        *_problems_of_motion(recording, depth_range or recording.depth_range, statistics),
         *_count_problems(statistics),
         *_cut_coordinates(statistics),
         *_unusual_times(recording),
         *_coarse_times(recording),
         *_frame_problems(recording.frames or recording.blurred_frames),
     ]
+
+
+def _problems_of_motion(
+    recording: EventRecording, depth_range: tuple[float, float] | None, statistics: EventStatistics
+) -> Iterator[Problem]:
+    """Problems of the poses, of the parallax, and of event rates that the motion of the camera does not explain."""
+    if not recording.has_poses:
+        return
+    gaps, jumps = pose_gaps(recording, statistics), pose_jumps(recording, statistics, depth_range)
+    swings = pose_swings(recording, statistics, depth_range, jumps)
+    silences, bursts = unusual_rates(recording, statistics, depth_range)
+    flag = _time_range_without(np.concatenate([gaps, jumps, swings, silences, bursts]), statistics)
+    yield from _left_out({**recording.shares_outside_poses, "events": index_events(recording).share_outside_poses})
+    yield from _pose_problems(recording, statistics, gaps, jumps, swings, flag)
+    yield from _distance_problems(recording, statistics, depth_range)
+    yield from _rate_problems(silences, bursts, flag)
 
 
 def pose_gaps(recording: EventRecording, statistics: EventStatistics) -> Int64[np.ndarray, "gaps 2"]:

@@ -220,7 +220,7 @@ class EventRecording:
     camera: Camera
     """Camera of the events."""
     trajectory: Trajectory
-    """Trajectory of the event camera."""
+    """Trajectory of the event camera. Without poses, that of a camera at rest."""
     stream_events: Callable[[], Iterator[Events]]
     """Function that yields the events as they are in the files, in pieces of about `EVENTS_AT_A_TIME`. All calls yield
     the same events, even if a file has grown since the reader opened it."""
@@ -266,6 +266,8 @@ class EventRecording:
     """Whether pixels that fire far more often than their neighbourhood are used."""
     keep_pose_gaps: bool = False
     """Whether instants within the gaps of the trajectory are used."""
+    has_poses: bool = True
+    """Whether the trajectory of the event camera is known."""
     as_read: EventRecording | None = None
     """The original recording if the poses or the camera of this one were refined. The events are the same."""
     pose_noise_taken_off: tuple[float, float] | None = None

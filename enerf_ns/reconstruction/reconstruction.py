@@ -14,8 +14,7 @@ from PIL import Image
 from rich.progress import track
 
 from enerf_ns.dataparsers.formats.conversion import new_folder, write_recording
-from enerf_ns.dataparsers.formats.event_recording import event_span
-from enerf_ns.dataparsers.formats.pose_files import RestPoses
+from enerf_ns.dataparsers.formats.event_recording import rest_poses
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.formats.writer import GrowingArray
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
@@ -90,9 +89,7 @@ def reconstruct(
             f"--cutoff-frequency is {cutoff_frequency:g}, but must be from 0 to {HIGHEST_CUTOFF_FREQUENCY:g} (Hz)."
         )
     with new_folder(source, output_dir) as folder:
-        has_poses = (source / "poses.txt").exists() or not (source / "recording.json").exists()
-        poses = None if has_poses else RestPoses(source, times=event_span(source))
-        recording = read_recording(source, poses=poses, **options)  # type: ignore[arg-type]
+        recording = read_recording(source, poses=rest_poses(source), **options)  # type: ignore[arg-type]
         if recording.bayer_pattern is not None:
             raise RecordingError(
                 f"{source} was recorded by a sensor with the colour filter {recording.bayer_pattern}, but frames are "
@@ -116,7 +113,7 @@ def reconstruct(
             files = _write_frames(shown, (camera.width, camera.height), made)
         frames = Frames(files, times, camera, recording.trajectory, numbers=numbers)
         with_frames = replace(recording, blurred_frames=frames, reconstructed_by=reconstruction.name)
-        sentences = write_recording(with_frames, folder, has_poses)
+        sentences = write_recording(with_frames, folder)
         shutil.rmtree(made)
     if recording.blurred_frames is not None:
         sentences.insert(0, "The blurred frames of the recording are left out.")

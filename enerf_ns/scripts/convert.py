@@ -76,8 +76,8 @@ class Convert:
         for sentence in sentences:
             print(printable(sentence))
         print(printable(f"The recording is in {output_dir}"))
-        if (source.is_dir() and not self.without_poses) or (self.poses is not None and self.camera is not None):
-            print_next(output_dir)
+        if source.is_dir() or self.camera is not None:
+            print_next(output_dir, (output_dir / "poses.txt").exists())
 
     def _given_poses(self) -> GivenPoses | None:
         """The poses that the user gave.

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
+from enerf_ns.dataparsers.formats.event_recording import rest_poses
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.errors import OutputError, printable, quoted
@@ -23,7 +24,8 @@ class Inspect:
     """Check a recording before training: print its contents and problems, and write a page of pictures."""
 
     data: Annotated[Path, tyro.conf.Positional]
-    """Folder of the recording. Nothing is written into it."""
+    """Folder of the recording. Nothing is written into it. One that enerf convert wrote without poses serves as
+    well."""
     output: Path | None = None
     """HTML file for the pictures. Default: inspect-NAME.html in the current folder, where NAME is the recording's."""
     options: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=format_flags())
@@ -39,7 +41,7 @@ class Inspect:
         check_outside_recordings("--output", output, data)
         corrections, chosen = None, self.options.given()
         if self.run is None:
-            recording = read_recording(data, **chosen)
+            recording = read_recording(data, poses=rest_poses(data), **chosen)
         else:
             refuse_beside_run(chosen)
             from enerf_ns.report.pose_figure import corrections_over_time  # here, since Nerfstudio takes seconds
@@ -62,5 +64,7 @@ class Inspect:
             reason = f"could not be written ({error.strerror})"
             raise OutputError(f"--output {output} {reason}; give another file.") from error
         print(printable(f"Pictures are in {output}"))
-        if not chosen and self.run is None:
+        if not recording.has_poses:
+            print("Before training, add poses, as docs/tutorial-poses.md shows.")
+        elif not chosen and self.run is None:
             print(f"train: ns-train enerf --data {quoted(data)}")

@@ -73,11 +73,14 @@ def test_the_commands_of_each_command_can_be_pasted(name: str, call, tmp_path: P
     assert commands(call("inspect", str(made))) == [["ns-train", "enerf", "--data", str(made)]]
     printed = call("convert", str(made), "--output-dir", str(again))
     assert commands(printed) == [["enerf", "inspect", str(again)], ["ns-train", "enerf", "--data", str(again)]]
+    printed = call("convert", str(again), "--output-dir", str(bare := tmp_path / "bare" / name), "--without-poses")
+    assert commands(printed) == [["enerf", "inspect", str(bare)]]
+    assert commands(call("inspect", str(bare))) == []
     printed = call("reconstruct", str(made), "--output-dir", str(frames))
     (command,) = commands(printed)
     assert command[:4] == ["ns-train", "enerf", "--data", str(frames)]
     pages = [file for file in os.listdir(tmp_path) if file.startswith("inspect-")]
-    assert sorted(os.listdir(tmp_path)) == sorted(["again", "frames", "made", *pages]), "nothing is executed"
+    assert sorted(os.listdir(tmp_path)) == sorted(["again", "bare", "frames", "made", *pages]), "nothing is executed"
 
 
 @pytest.mark.slow

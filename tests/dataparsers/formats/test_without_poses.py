@@ -17,9 +17,10 @@ from test_bad_input import is_one_sentence
 from test_event_recording import write_recording
 
 from enerf_ns.dataparsers.formats.conversion import convert_recording
-from enerf_ns.dataparsers.formats.event_recording import write_poses
+from enerf_ns.dataparsers.formats.event_recording import rest_poses, write_poses
 from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags, RestPoses
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
+from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.errors import RecordingError, UserError
 from enerf_ns.reconstruction.reconstruction import reconstruct
 
@@ -92,6 +93,8 @@ def test_all_but_the_poses_are_converted(tmp_path: Path, name: str):
     found = read_recording(tmp_path / "new", poses=given).trajectory
     np.testing.assert_array_equal(found.times - first, true.times - true_first)
     np.testing.assert_array_equal(found.positions, true.positions)
+    look = Inspection.of(read_recording(tmp_path / "new", poses=rest_poses(tmp_path / "new")))
+    assert look.found()["poses"] == "none yet" and "Trajectory" not in look.page()
 
 
 def test_a_clock_below_zero(tmp_path: Path):
@@ -122,6 +125,27 @@ def test_frames_from_events_need_no_poses(recording: Path, tmp_path: Path, has_f
     own, expected = (sorted((made[name] / "blurred_frames").iterdir()) for name in ("without", "with"))
     assert [file.name for file in own] == [file.name for file in expected] and len(own) > 2
     assert [file.read_bytes() for file in own] == [file.read_bytes() for file in expected]
+
+
+def test_events_and_frames_are_inspected(recording: Path, tmp_path: Path):
+    """Rows of events, frames and sensor are those of the same recording with poses; so are problems, except those of
+    the motion."""
+    convert_recording(recording, tmp_path / "with")
+    polarity = np.load(tmp_path / "with/events/p.npy")
+    np.save(tmp_path / "with/events/p.npy", 1 - polarity.clip(0))
+    shutil.copytree(tmp_path / "with", tmp_path / "without")
+    (tmp_path / "without/poses.txt").unlink()
+    whole = Inspection.of(read_recording(tmp_path / "with"))
+    found = Inspection.of(read_recording(tmp_path / "without", poses=rest_poses(tmp_path / "without")))
+    assert found.sensor.rows() == whole.sensor.rows()
+    assert found.found() == {**whole.found(), "poses": "none yet"}
+    assert found.numbers().items() < whole.numbers().items()
+    exchanged = [problem for problem in whole.problems if "On and off events are exchanged" in problem.what]
+    assert len(exchanged) == 1 and exchanged[0] in found.problems
+    assert {problem.what for problem in found.problems} <= {problem.what for problem in whole.problems}
+    assert found.focus() == {} and found.edge_depth() is None
+    assert "poses" in found.unknown[0].sentence and "there are no poses yet" in found.unknown[0].sentence
+    assert "Trajectory from above" in whole.page() and "Trajectory from above" not in found.page()
 
 
 @pytest.mark.parametrize("number", [1, 2])
