@@ -168,6 +168,8 @@ class HashGrid(nn.Module):
         growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
         scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as in Nerfstudio
         self.register_buffer("scalings", scalings, persistent=False)
+        self.num_sloped = num_levels
+        """Number of the coarsest levels that are differentiated; the finer ones are constants."""
         table = torch.rand(num_levels * 2**log2_table_size, features_per_level) * 2 - 1
         self.table = nn.Parameter(table * init_scale)
 
@@ -179,4 +181,9 @@ class HashGrid(nn.Module):
         """
         if x.shape[-1] != 3:
             raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")
-        return fitting(self.backend, x, self.table)(x, self.table, self.scalings)
+        encoding = fitting(self.backend, x, self.table)(x, self.table, self.scalings)
+        num_levels = len(self.scalings)
+        if self.num_sloped == num_levels:
+            return encoding
+        is_sloped = torch.arange(self.out_dim, device=x.device) < self.num_sloped * (self.out_dim // num_levels)
+        return torch.where(is_sloped, encoding, encoding.detach())

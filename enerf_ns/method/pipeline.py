@@ -39,6 +39,7 @@ from enerf_ns.method.stopwatch import Stopwatch
 from enerf_ns.method.viewer.guard import guard_viser
 from enerf_ns.poses.refiner import (
     BEGINS_UNTIL,
+    FINEST_SLOPES,
     FIRST_STEP,
     FROZEN_FROM,
     LOOK_AGAIN_EVERY,
@@ -312,7 +313,15 @@ class EnerfPipeline(VanillaPipeline):
         times = manager.event_times(some, sensor)
         camera = manager.event_camera
         unit = torch.as_tensor(sensor.mean_threshold).item()
-        with torch.random.fork_rng(devices=[] if self.device == "cpu" else None):  # training must draw as without this
+        distance = 2.0  # of a panorama, in contracted space
+        if not model.config.panorama:
+            near, far = manager.depth_range
+            far = min(far, manager.config.dataparser.contraction_depth or far)
+            distance = camera.scale * math.sqrt(near * far)
+        with (
+            model.field.geometry.slopes_over(FINEST_SLOPES * distance),
+            torch.random.fork_rng(devices=[] if self.device == "cpu" else None),  # training must draw as without this
+        ):
             rgb, slopes = render_slopes(
                 model,
                 rays,

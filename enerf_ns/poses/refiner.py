@@ -90,6 +90,10 @@ it learns from as many pairs."""
 SETTLED_AFTER = 200.0
 """Step before which that error is larger, in inverse proportion to the step."""
 
+FINEST_SLOPES = math.radians(0.6)
+"""Angle (radians) that the smallest cells of the hash grid whose slopes count take up at a usual distance. Poses are
+wrong by some tenths of a degree, and the slope of a finer detail does not reach as far."""
+
 SMALLEST_TURN = math.radians(2.0)
 """Smallest root mean square turn of the camera about its second axis (radians) with which mount and lens are corrected
 by default."""

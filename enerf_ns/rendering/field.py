@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal, cast
 
 import torch
@@ -142,6 +144,22 @@ class HashDensity(nn.Module):
         parts = output.t().split_with_sizes([1, output.shape[1] - 1])
         density, features = (part.t().view(*unit.shape[:-1], len(part)) for part in parts)
         return self.init_density * limited_exp(widened(density)), features
+
+    @contextmanager
+    def slopes_over(self, distance: float) -> Iterator[None]:
+        """Context in which only levels whose cells are at least so wide are differentiated with respect to positions.
+
+        The other levels are constants. So slopes do not show details that are smaller than `distance`.
+
+        Args:
+            distance: Smallest side of a cell, scene units.
+        """
+        cells = (4.0 if self.contraction else float((self.aabb[1] - self.aabb[0]).max())) / self.grid.scalings
+        self.grid.num_sloped = int((cells >= distance).sum())
+        try:
+            yield
+        finally:
+            self.grid.num_sloped = len(self.grid.scalings)
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
         """Returns the density, in 1 / scene unit."""

@@ -127,6 +127,18 @@ def test_gradient_only_where_needed(grid):
         assert not grid(x).requires_grad
 
 
+@pytest.mark.parametrize("number", range(6))
+def test_fine_levels_as_constants(grid, number: int):
+    x = positions("inside", grid.table.device).requires_grad_()
+    whole, weights = grid(x), torch.randn(grid.out_dim, device=x.device)
+    part = 2 * number
+    expected = torch.autograd.grad((whole[:, :part] * weights[:part]).sum(), x, retain_graph=True)[0]
+    grid.num_sloped = number
+    found = grid(x)
+    assert torch.equal(found, whole)
+    torch.testing.assert_close(torch.autograd.grad((found * weights).sum(), x)[0], expected)
+
+
 def test_shapes_and_strides(grid):
     x = positions("inside", grid.table.device)[:60]
     expected = grid(x)

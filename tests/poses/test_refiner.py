@@ -15,10 +15,12 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
+from pose_refinement import errors, made_wrong
 from recordings import write_event_recording
 from scipy.spatial.transform import Rotation
 from torch import nn
 
+from enerf_ns.bench.validation import FAR, _recording, _straight
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -30,6 +32,7 @@ from enerf_ns.poses.findings import findings, picture_shift
 from enerf_ns.poses.posed_camera import PosedCamera
 from enerf_ns.poses.refiner import NUM_SHAPES, Part, PoseRefiner, RefinerConfig, Slopes, render_slopes
 from enerf_ns.simulator.engine import simulate
+from enerf_ns.simulator.event_sensor import SensorSettings
 from enerf_ns.simulator.settings import SimulationSettings
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -371,3 +374,20 @@ def test_a_training_finds_the_clock(simulated, tmp_path: Path, delay: float, is_
         without = train(method_config("enerf", folder, tmp_path / "without", {**settings, **parts}))
         weights, same = (one.pipeline.model.field.state_dict() for one in (run, without))
         assert all(torch.equal(weights[name], same[name]) for name in same)
+
+
+@pytest.mark.exhaustive
+def test_a_drift_of_many_pixels_is_corrected(tmp_path: Path):
+    """Slopes of details as fine as these pixels do not reach as far, and no correction would begin."""
+    path = _straight(0.6, (-0.15, 0, 0), (0.15, 0.05, 0.05), (-0.1, 2, 0), (0.1, 2, 0))
+    sequence = _recording("far", FAR, path, (640, 480), light=False, num_frames=21)
+    settings = sequence.simulation_settings(tmp_path, layout="event_recording", sensor=SensorSettings())
+    simulate(settings, tmp_path / "right")
+    made_wrong(tmp_path / "right", tmp_path / "wrong", {"drift": (10.0, 0.5)}, seed=0)
+    few = {"max_num_iterations": 900, "evaluation_share": 0.0}
+    run = train(method_config("enerf", tmp_path / "wrong", tmp_path / "runs", few))
+    assert run.pipeline.poses is not None and run.pipeline.poses.corrected == ["drift"]
+    true = read_recording(tmp_path / "right").trajectory
+    given = read_recording(tmp_path / "wrong").trajectory
+    before, after = errors(true, given), errors(true, run.pipeline.datamanager.recording.trajectory)
+    assert after[1] < 0.75 * before[1] and after[0] < before[0]

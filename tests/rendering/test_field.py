@@ -57,6 +57,33 @@ def test_brightness_stays_within_what_it_spans(channels: int, brightness: str, d
     assert (colour >= darkest - 1e-6).all() and (colour <= 1).all()
 
 
+@pytest.mark.parametrize(("distance", "kept"), [(0.2, 3), (0.3, 2), (0.5, 2), (0.6, 1), (1.1, 0)])
+def test_slopes_over_a_distance(distance: float, kept: int):
+    """The levels have cells of 1, 1/2 and 1/4 along the longest side of the box, which is 4."""
+    geometry, points = field().geometry, 2 * torch.rand(50, 3) - 1
+    within = (16 * geometry.unit(points)) % 1  # not on a face of a cell, where slopes jump
+    points = points[((within - 0.5).abs() < 0.45).all(dim=1)].requires_grad_()
+    (whole,) = torch.autograd.grad(geometry.density_fn(points).log().sum(), points)
+    with geometry.slopes_over(distance):
+        density = geometry.density_fn(points)
+    assert torch.equal(density, geometry.density_fn(points))
+    (found,) = torch.autograd.grad(density.log().sum(), points)
+    with torch.no_grad():
+        steps = 1e-4 * torch.eye(3)
+        features = geometry.grid(geometry.unit(points))
+        moved = torch.stack([geometry.grid(geometry.unit(points + s * step)) for step in steps for s in (-1, 1)])
+        moved[..., 2 * kept :] = features[:, 2 * kept :]
+        ends = geometry.network(moved.flatten(0, 1))[:, 0].view(3, 2, -1)
+        expected = ((ends[:, 1] - ends[:, 0]) / 2e-4).t()
+    torch.testing.assert_close(found, expected, atol=0.03 * float(whole.abs().max()), rtol=0.0)
+    assert torch.equal(found, whole) == (kept == 3)
+
+    with pytest.raises(KeyError), geometry.slopes_over(distance):
+        raise KeyError
+    (again,) = torch.autograd.grad(geometry.density_fn(points).log().sum(), points)
+    assert torch.equal(again, whole)
+
+
 LOGITS = torch.cat([torch.linspace(-1e4, 1e4, 401), torch.linspace(-100.0, 100.0, 401), torch.tensor([-1e30, 1e30])])
 
 
