@@ -168,7 +168,7 @@ class HashGrid(nn.Module):
         growth = np.exp((np.log(max_res) - np.log(min_res)) / (num_levels - 1)) if num_levels > 1 else 1.0
         scalings = torch.floor(min_res * growth ** torch.arange(num_levels))  # float32, rounded as in Nerfstudio
         self.register_buffer("scalings", scalings, persistent=False)
-        self.num_sloped = num_levels
+        self.num_differentiated = num_levels
         """Number of the coarsest levels that are differentiated; the finer ones are constants."""
         table = torch.rand(num_levels * 2**log2_table_size, features_per_level) * 2 - 1
         self.table = nn.Parameter(table * init_scale)
@@ -183,7 +183,8 @@ class HashGrid(nn.Module):
             raise ValueError(f"positions have shape {tuple(x.shape)}, but the last axis must be 3")
         encoding = fitting(self.backend, x, self.table)(x, self.table, self.scalings)
         num_levels = len(self.scalings)
-        if self.num_sloped == num_levels:
+        if self.num_differentiated == num_levels:
             return encoding
-        is_sloped = torch.arange(self.out_dim, device=x.device) < self.num_sloped * (self.out_dim // num_levels)
-        return torch.where(is_sloped, encoding, encoding.detach())
+        num_columns = self.num_differentiated * (self.out_dim // num_levels)
+        is_differentiated = torch.arange(self.out_dim, device=x.device) < num_columns
+        return torch.where(is_differentiated, encoding, encoding.detach())

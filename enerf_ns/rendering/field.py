@@ -155,11 +155,11 @@ class HashDensity(nn.Module):
             distance: Smallest side of a cell, scene units.
         """
         cells = (4.0 if self.contraction else float((self.aabb[1] - self.aabb[0]).max())) / self.grid.scalings
-        self.grid.num_sloped = int((cells >= distance).sum())
+        self.grid.num_differentiated = int((cells >= distance).sum())
         try:
             yield
         finally:
-            self.grid.num_sloped = len(self.grid.scalings)
+            self.grid.num_differentiated = len(self.grid.scalings)
 
     def density_fn(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
         """Returns the density, in 1 / scene unit."""

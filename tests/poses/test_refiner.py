@@ -378,7 +378,7 @@ def test_a_training_finds_the_clock(simulated, tmp_path: Path, delay: float, is_
 
 @pytest.mark.exhaustive
 def test_a_drift_of_many_pixels_is_corrected(tmp_path: Path):
-    """Slopes of details as fine as these pixels do not reach as far, and no correction would begin."""
+    """Slopes of details as fine as these pixels do not reach as far."""
     path = _straight(0.6, (-0.15, 0, 0), (0.15, 0.05, 0.05), (-0.1, 2, 0), (0.1, 2, 0))
     sequence = _recording("far", FAR, path, (640, 480), light=False, num_frames=21)
     settings = sequence.simulation_settings(tmp_path, layout="event_recording", sensor=SensorSettings())
