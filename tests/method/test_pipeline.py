@@ -15,6 +15,7 @@ from small_runs import set_up, small_config
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.sensor_estimates import estimates as sensor_estimates
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
+from enerf_ns.method import pipeline as method_pipeline
 from enerf_ns.method.pipeline import SLOPE_NS, SLOPE_PAIRS
 from enerf_ns.sensor.response import Logarithm, luma
 
@@ -90,6 +91,28 @@ def test_slopes_are_those_of_what_is_rendered(pipeline: Any):
         assert expected.abs().max() > 1.0
         torch.testing.assert_close(found[:number, instant], expected.float(), rtol=1e-3, atol=1e-2)
     pipeline.train()
+
+
+def test_only_wide_cells_have_a_say_in_poses(pipeline: Any, monkeypatch):
+    """Cells whose angle at the geometric mean of the range of depth is smaller than the stated one add nothing."""
+    grid, manager = pipeline.model.field.geometry.grid, pipeline.datamanager
+    box = pipeline.model.field.geometry.aabb
+    distance = manager.event_camera.scale * np.sqrt(np.prod(manager.depth_range))
+    angles = (float((box[1] - box[0]).max()) / grid.scalings / distance).tolist()
+    monkeypatch.setattr(pipeline, "num_steps", 1000)
+    monkeypatch.setattr(method_pipeline, "FINEST_SLOPES", np.sqrt(angles[1] * angles[2]))
+    assert method_pipeline.FINEST_SLOPES < 0.9 * angles[1] and pipeline.poses.allowed
+    batch = manager.next_batch(pipeline.model.sensor).events
+    table = grid.table.view(len(angles), -1)
+    said = []
+    for kept in (slice(0, 2), slice(2, None)):
+        with torch.no_grad():
+            table.zero_()
+            table[kept].normal_()
+        pipeline.poses.normal.zero_()
+        pipeline._refine_poses(pipeline.poses, batch, 100)
+        said.append(pipeline.poses.normal.diagonal()[: pipeline.poses.number].abs().max())
+    assert said[0] > 0.0 and said[1] == 0.0
 
 
 @pytest.mark.parametrize(("mode", "blind", "starts"), [("val", 0, True), ("test", 0, False), ("val", 1000, False)])
