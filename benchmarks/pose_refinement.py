@@ -305,7 +305,7 @@ def chosen(results: list[dict[str, Any]], recording: str, fault: str, row: str, 
 def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int) -> str:
     """PSNR and correlation of each fault on each recording after as many steps, fixed and refined, as Markdown.
 
-    Wrong poses that stay fixed are left out where no training of them went on for as many steps.
+    A recording has no column of fixed poses, or of refined ones, where no training of them went on for as many steps.
     """
 
     def cell(recording: str, fault: str, row: str) -> str:
@@ -314,10 +314,14 @@ def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults
         spread = f" ± {np.std(psnr, ddof=1):.2f}" if len(runs) > 1 else ""
         return f"{np.mean(psnr):.2f}{spread}, {np.mean(correlation):.2f}" if runs else "-"
 
-    head = ["wrong", *(cell for name in recordings for cell in (f"`{name}` fixed", "refined"))]
+    columns = [
+        (name, [row for row in COMPARED if any(chosen(results, name, fault, row, steps) for fault in faults)])
+        for name in recordings
+    ]
+    head = ["wrong", *(f"`{name}` {row}" if row == rows[0] else row for name, rows in columns for row in rows)]
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for fault in faults:
-        cells = [cell(recording, fault, row) for recording in recordings for row in COMPARED]
+        cells = [cell(name, fault, row) for name, rows in columns for row in rows]
         lines.append(f"| {' | '.join([fault, *cells])} |")
     return "\n".join(lines)
 
