@@ -28,6 +28,8 @@ from scipy.spatial.transform import Rotation
 POSES_EVERY_NS = 5_000_000
 DRIFT_KNOTS = 5
 EDGE_NS = 20_000_000
+TRACK_INSTANTS, FEWEST_INSTANTS = 100, 10
+"""Number of instants of a track of a point of the scene, and fewest of them at which it is in the picture."""
 
 FAULTS: dict[str, dict[str, Any]] = {
     "none": {},
@@ -232,6 +234,8 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         "focal": after.camera.fx / before.camera.fx,
         "ate_before": errors(true, given.trajectory),
         "ate_after": errors(true, after.trajectory),
+        "reprojection_before": reprojection_error(read_recording(right), given),
+        "reprojection_after": reprojection_error(read_recording(right), after),
     }
 
 
@@ -295,6 +299,56 @@ def errors(true: Any, other: Any) -> tuple[float, float]:
     return 1e3 * float(np.sqrt((off**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((left**2).sum(axis=1).mean())))
 
 
+def reprojection_error(right: Any, other: Any) -> float:
+    """Root mean square distance (pixels) of points of a scene from where they are seen, after triangulation.
+
+    Points are placed in the depth range of the recording with the right poses, and seen along the path. Each is then
+    triangulated with the poses, the clock and the lens of the other recording, as a direction and an inverse depth
+    (Civera et al., "Inverse Depth Parametrization for Monocular SLAM", IEEE Transactions on Robotics 2008). What is
+    left is the part of their errors that no scene explains.
+    """
+    import torch
+    from scipy.ndimage import map_coordinates
+
+    first = max(right.trajectory.start, other.trajectory.start) + EDGE_NS
+    last = min(right.trajectory.end, other.trajectory.end) - EDGE_NS
+    times = torch.from_numpy(np.linspace(first, last, TRACK_INSTANTS).astype(np.int64))
+    true, found = (recording.trajectory.poses(times).numpy() for recording in (right, other))
+    camera, (near, far) = right.camera, right.depth_range
+    last_pixel = np.array([camera.width, camera.height]) - 1.0
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    directions = other.camera.pixel_directions()
+    rays = directions[..., :2] / directions[..., 2:]
+    squares: list[np.ndarray] = []
+    for seen_at in np.linspace(0, TRACK_INSTANTS - 1, 5).astype(int):
+        for depth in (near, np.sqrt(near * far), far):
+            for share in np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2):
+                local = np.array([*((share * last_pixel - middle) / focal), 1.0]) * depth
+                point = true[seen_at, :, :3] @ local + true[seen_at, :, 3]
+                seen = np.einsum("nji,nj->ni", true[:, :, :3], point - true[:, :, 3])
+                pixels = seen[:, :2] / seen[:, 2:] * focal + middle
+                is_seen = (seen[:, 2] > 0.0) & ((pixels >= 0.0) & (pixels <= last_pixel)).all(axis=1)
+                if is_seen.sum() < FEWEST_INSTANTS:
+                    continue
+                where = pixels[is_seen, ::-1].T
+                wanted = np.stack([map_coordinates(rays[..., axis], where, order=1) for axis in (0, 1)], axis=1)
+                back, place = found[is_seen, :, :3].transpose(0, 2, 1), found[seen_at, :, 3]
+                across, along = (
+                    back @ found[seen_at, :, :3],
+                    np.einsum("nij,nj->ni", back, place - found[is_seen, :, 3]),
+                )
+                ray = np.array([*local[:2] / depth, 1.0 / depth])
+                for _ in range(10):  # Gauss-Newton steps
+                    inside = across @ [*ray[:2], 1.0] + ray[2] * along
+                    projected = inside[:, :2] / inside[:, 2:]
+                    off = wanted - projected
+                    columns = np.stack([across[:, :, 0], across[:, :, 1], along], axis=2)
+                    slopes = (columns[:, :2] - projected[..., None] * columns[:, 2:]) / inside[:, 2:, None]
+                    ray += np.linalg.lstsq(slopes.reshape(-1, 3), off.ravel(), rcond=None)[0]
+                squares.append(((focal * off) ** 2).sum(axis=1))
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
 def chosen(results: list[dict[str, Any]], recording: str, fault: str, row: str, steps: int) -> list[dict[str, Any]]:
     """The trainings of one row, by seed."""
     wanted = recording, fault, row, steps
@@ -327,7 +381,10 @@ def scores_by_fault(results: list[dict[str, Any]], recordings: list[str], faults
 
 
 def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults: list[str], steps: int) -> str:
-    """What refinement found of each fault on each recording, one value for each seed, as Markdown."""
+    """What refinement found of each fault on each recording, one value for each seed, as Markdown.
+
+    Errors of trajectories are means over the seeds; in pixels, over those whose reprojection error was measured.
+    """
 
     def values(runs: list[dict[str, Any]], key: str) -> list[Any]:
         return [one[key] for one in runs]
@@ -335,6 +392,10 @@ def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults:
     def errors(runs: list[dict[str, Any]], key: str) -> str:
         positions, turns = np.mean(values(runs, key), axis=0)
         return f"{positions:.1f} mm and {turns:.2f}°"
+
+    def in_pixels(runs: list[dict[str, Any]]) -> str:
+        ends = [[one[key] for one in runs if key in one] for key in ("reprojection_before", "reprojection_after")]
+        return f"; {np.mean(ends[0]):.2f} → {np.mean(ends[1]):.2f} px" if ends[0] else ""
 
     def cell(recording: str, fault: str) -> str:
         runs, wrong = chosen(results, recording, fault, "refined", steps), FAULTS[fault]
@@ -349,7 +410,7 @@ def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults:
             parts = ([part for part in PARTS_OF_MOUNT if part in found] for found in values(runs, "corrected"))
             told.append(", ".join(" and ".join(found) or "no part" for found in parts))
         if {"noise", "drift"} & set(wrong):
-            told.append(f"{errors(runs, 'ate_before')} → {errors(runs, 'ate_after')}")
+            told.append(f"{errors(runs, 'ate_before')} → {errors(runs, 'ate_after')}{in_pixels(runs)}")
         return "; ".join(told)
 
     lines = [f"| wrong | {' | '.join(f'`{name}`' for name in recordings)} |", f"|{' --- |' * (len(recordings) + 1)}"]

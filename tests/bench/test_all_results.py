@@ -127,7 +127,7 @@ def test_tables_of_wrong_poses_have_the_trainings_of_their_number_of_steps():
         {**one, "seed": 1, "psnr": 22.0, "clock": 10.25, "focal": 1.0, "corrected": ["clock", "rotation"], **ate},
         {**one, "seed": 0, "psnr": 20.0, "clock": 9.75, "focal": 0.97, "corrected": ["translation", "rotation"], **ate},
     ]
-    seeds[0]["ate_after"] = [3.0, 0.3]
+    seeds[0] |= {"ate_after": [3.0, 0.3], "reprojection_before": 2.0, "reprojection_after": 0.25}
     longer = {**seeds[0], "steps": 20, "psnr": 30.0}
     fixed = {**longer, "row": "fixed", "psnr": 12.0}
     trained = [*seeds, longer, fixed]
@@ -138,5 +138,5 @@ def test_tables_of_wrong_poses_have_the_trainings_of_their_number_of_steps():
     found = pose_refinement.found_by_fault(trained, ["room", "hall"], ["all"], 10)
     assert found.splitlines()[2] == (
         "| all | clock 9.75, 10.25 ms; focal length 0.970, 1.000; rotation and translation, rotation; "
-        "4.0 mm and 0.40° → 2.5 mm and 0.20° | - |"
+        "4.0 mm and 0.40° → 2.5 mm and 0.20°; 2.00 → 0.25 px | - |"
     )

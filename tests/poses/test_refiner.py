@@ -3,6 +3,7 @@ in, and a training with a wrong clock against the right one."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -15,7 +16,7 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from pose_refinement import errors, made_wrong
+from pose_refinement import errors, made_wrong, reprojection_error
 from recordings import write_event_recording
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -391,3 +392,35 @@ def test_a_drift_of_many_pixels_is_corrected(tmp_path: Path):
     given = read_recording(tmp_path / "wrong").trajectory
     before, after = errors(true, given), errors(true, run.pipeline.datamanager.recording.trajectory)
     assert after[1] < 0.75 * before[1] and after[0] < before[0]
+
+
+def test_what_another_scene_explains_is_no_reprojection_error():
+    """A world that is turned, shifted and scaled, and the focal length of a camera that only slides."""
+    right = replace(recording(), depth_range=(1.0, 3.0))
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
+    path = right.trajectory
+    places = 1.7 * turn.apply(path.positions) + [1.0, 2.0, 3.0]
+    turned = (turn * Rotation.from_quat(path.quaternions)).as_quat()
+    moved = replace(right, trajectory=Trajectory(path.times, places, turned))
+    assert reprojection_error(right, moved) < 1e-6
+
+    unturned = trajectory(turns=0.0)
+    level = unturned.positions * [1.0, 1.0, 0.0]
+    sliding = replace(right, trajectory=Trajectory(unturned.times, level, unturned.quaternions))
+    longer = replace(CAMERA, fx=1.03 * CAMERA.fx, fy=1.03 * CAMERA.fy)
+    assert reprojection_error(sliding, replace(sliding, camera=longer)) < 1e-3
+    assert reprojection_error(right, replace(right, camera=longer)) > 0.1  # 3 % of 12 pixels of turning
+
+
+def test_no_scene_explains_noise_of_the_poses():
+    """Turns about the two axes across the view move each pixel by the focal length times them; two thirds of their
+    variance are left between two poses, on average."""
+    narrow = Camera(64, 48, 600.0, 600.0, 32.0, 24.0)
+    path = trajectory(turns=0.01)
+    right = replace(recording(), camera=narrow, trajectory=path, depth_range=(1.0, 3.0))
+    radians = 1e-3
+    noise = Rotation.from_rotvec(radians * np.random.default_rng(0).normal(size=(len(path.times), 3)) * [1.0, 1.0, 0.0])
+    turned = (Rotation.from_quat(path.quaternions) * noise).as_quat()
+    noisy = replace(right, trajectory=Trajectory(path.times, path.positions, turned))
+    left = math.sqrt(2.0 / 3.0)
+    assert reprojection_error(right, noisy) == pytest.approx(600.0 * radians * math.sqrt(2.0) * left, rel=0.1)
