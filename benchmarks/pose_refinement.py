@@ -55,6 +55,7 @@ wrong, as other codes refine poses."""
 
 COMPARED = "fixed", "refined"
 PARTS_OF_MOUNT = "rotation", "translation"
+REPROJECTION = "reprojection_before", "reprojection_after"
 
 ADAM_RATE, ADAM_DECAYS = 0.02, (0.9, 0.99)
 """Learning rate, in the unit of each number, and decays of the moments."""
@@ -234,8 +235,10 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         "focal": after.camera.fx / before.camera.fx,
         "ate_before": errors(true, given.trajectory),
         "ate_after": errors(true, after.trajectory),
-        "reprojection_before": reprojection_error(read_recording(right), given),
-        "reprojection_after": reprojection_error(read_recording(right), after),
+        **{
+            key: reprojection_error(read_recording(right), one)
+            for key, one in zip(REPROJECTION, (given, after), strict=True)
+        },
     }
 
 
@@ -393,10 +396,6 @@ def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults:
         positions, turns = np.mean(values(runs, key), axis=0)
         return f"{positions:.1f} mm and {turns:.2f}°"
 
-    def in_pixels(runs: list[dict[str, Any]]) -> str:
-        ends = [[one[key] for one in runs if key in one] for key in ("reprojection_before", "reprojection_after")]
-        return f"; {np.mean(ends[0]):.2f} → {np.mean(ends[1]):.2f} px" if ends[0] else ""
-
     def cell(recording: str, fault: str) -> str:
         runs, wrong = chosen(results, recording, fault, "refined", steps), FAULTS[fault]
         if not runs:
@@ -410,7 +409,10 @@ def found_by_fault(results: list[dict[str, Any]], recordings: list[str], faults:
             parts = ([part for part in PARTS_OF_MOUNT if part in found] for found in values(runs, "corrected"))
             told.append(", ".join(" and ".join(found) or "no part" for found in parts))
         if {"noise", "drift"} & set(wrong):
-            told.append(f"{errors(runs, 'ate_before')} → {errors(runs, 'ate_after')}{in_pixels(runs)}")
+            told.append(f"{errors(runs, 'ate_before')} → {errors(runs, 'ate_after')}")
+        before, after = ([one[key] for one in runs if key in one] for key in REPROJECTION)
+        if before:
+            told.append(f"{np.mean(before):.2f} → {np.mean(after):.2f} px")
         return "; ".join(told)
 
     lines = [f"| wrong | {' | '.join(f'`{name}`' for name in recordings)} |", f"|{' --- |' * (len(recordings) + 1)}"]
