@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ DRIFT_KNOTS = 5
 EDGE_NS = 20_000_000
 TRACK_INSTANTS, FEWEST_INSTANTS = 100, 10
 """Number of instants of a track of a point of the scene, and fewest of them at which it is in the picture."""
+TRACK_VIEWS = 0, 24, 49, 74, 99
+"""Instants at whose views points are placed."""
 
 FAULTS: dict[str, dict[str, Any]] = {
     "none": {},
@@ -309,6 +312,10 @@ def reprojection_error(right: Any, other: Any) -> float:
     triangulated with the poses, the clock and the lens of the other recording, as a direction and an inverse depth
     (Civera et al., "Inverse Depth Parametrization for Monocular SLAM", IEEE Transactions on Robotics 2008). What is
     left is the part of their errors that no scene explains.
+
+    Args:
+        right: Recording with a depth range and a pinhole camera.
+        other: The same recording with other poses, or another camera of the same size.
     """
     import torch
     from scipy.ndimage import map_coordinates
@@ -322,34 +329,39 @@ def reprojection_error(right: Any, other: Any) -> float:
     focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     directions = other.camera.pixel_directions()
     rays = directions[..., :2] / directions[..., 2:]
+    shares = product((0.1, 0.5, 0.9), repeat=2)
     squares: list[np.ndarray] = []
-    for seen_at in np.linspace(0, TRACK_INSTANTS - 1, 5).astype(int):
-        for depth in (near, np.sqrt(near * far), far):
-            for share in np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2):
-                local = np.array([*((share * last_pixel - middle) / focal), 1.0]) * depth
-                point = true[seen_at, :, :3] @ local + true[seen_at, :, 3]
-                seen = np.einsum("nji,nj->ni", true[:, :, :3], point - true[:, :, 3])
-                pixels = seen[:, :2] / seen[:, 2:] * focal + middle
-                is_seen = (seen[:, 2] > 0.0) & ((pixels >= 0.0) & (pixels <= last_pixel)).all(axis=1)
-                if is_seen.sum() < FEWEST_INSTANTS:
-                    continue
-                where = pixels[is_seen, ::-1].T
-                wanted = np.stack([map_coordinates(rays[..., axis], where, order=1) for axis in (0, 1)], axis=1)
-                back, place = found[is_seen, :, :3].transpose(0, 2, 1), found[seen_at, :, 3]
-                across, along = (
-                    back @ found[seen_at, :, :3],
-                    np.einsum("nij,nj->ni", back, place - found[is_seen, :, 3]),
-                )
-                ray = np.array([*local[:2] / depth, 1.0 / depth])
-                for _ in range(10):  # Gauss-Newton steps
-                    inside = across @ [*ray[:2], 1.0] + ray[2] * along
-                    projected = inside[:, :2] / inside[:, 2:]
-                    off = wanted - projected
-                    columns = np.stack([across[:, :, 0], across[:, :, 1], along], axis=2)
-                    slopes = (columns[:, :2] - projected[..., None] * columns[:, 2:]) / inside[:, 2:, None]
-                    ray += np.linalg.lstsq(slopes.reshape(-1, 3), off.ravel(), rcond=None)[0]
-                squares.append(((focal * off) ** 2).sum(axis=1))
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    for view, depth, share in product(TRACK_VIEWS, (near, np.sqrt(near * far), far), [*shares]):
+        ray = np.array([*((share * last_pixel - middle) / focal), 1.0 / depth])
+        seen = _seen_by(true, view, ray)
+        pixels = seen[:, :2] / seen[:, 2:] * focal + middle
+        is_seen = (seen[:, 2] > 0.0) & ((pixels >= 0.0) & (pixels <= last_pixel)).all(axis=1)
+        if is_seen.sum() < FEWEST_INSTANTS:
+            continue
+        where = pixels[is_seen, ::-1].T
+        wanted = np.stack([map_coordinates(rays[..., axis], where, order=1) for axis in (0, 1)], axis=1)
+        squares.append((focal * _off_after_triangulation(found, view, ray, is_seen, wanted)) ** 2)
+    return float(np.sqrt(np.concatenate(squares).sum(axis=1).mean()))
+
+
+def _seen_by(poses: np.ndarray, view: int, ray: np.ndarray) -> np.ndarray:
+    """Directions (poses, 3), of any length, in which cameras see the point on a ray of one view, given by x / z, y / z
+    and 1 / z."""
+    place = poses[view, :, :3] @ [*ray[:2], 1.0] + ray[2] * (poses[view, :, 3] - poses[:, :, 3])
+    return np.einsum("nji,nj->ni", poses[:, :, :3], place)
+
+
+def _off_after_triangulation(
+    poses: np.ndarray, view: int, start: np.ndarray, is_seen: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
+    """Distances (instants, 2) in x / z and y / z of the point that fits best from where it is seen."""
+    from scipy.optimize import least_squares
+
+    def off(ray: np.ndarray) -> np.ndarray:
+        seen = _seen_by(poses, view, ray)[is_seen]
+        return (wanted - seen[:, :2] / seen[:, 2:]).ravel()
+
+    return least_squares(off, start, method="lm", xtol=1e-12, ftol=1e-12).fun.reshape(-1, 2)
 
 
 def chosen(results: list[dict[str, Any]], recording: str, fault: str, row: str, steps: int) -> list[dict[str, Any]]:
