@@ -77,6 +77,11 @@ the area 0.998 (`benchmarks/instants.py`)."""
 SLOPE_NS = 1_000_000
 """Time (ns) before and after an instant over which the slope of brightness is rendered."""
 
+TAKEN_BACK = (
+    "The last corrections of clock, poses and lens are taken back, and no further ones are made, because events fit "
+    "them worse than those before; check --depth-range, and poses and calibration with enerf inspect."
+)
+
 
 @dataclass
 class EnerfPipelineConfig(VanillaPipelineConfig):
@@ -299,8 +304,8 @@ class EnerfPipeline(VanillaPipeline):
         """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""
         may_begin = step < BEGINS_UNTIL * self.num_steps
         every = LOOK_AGAIN_EVERY if refiner.corrected and may_begin else LOOK_EVERY
-        if not (refiner.corrected or may_begin):
-            return  # nothing was corrected, and nothing will be
+        if refiner.is_taken_back or not (refiner.corrected or may_begin):
+            return  # nothing will be corrected any more
         if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
@@ -349,6 +354,8 @@ class EnerfPipeline(VanillaPipeline):
         )
         if int(refiner.looks) % LOOKS_A_SOLUTION == 0 and refiner.solve(step, may_begin):
             self._correct_poses()
+            if refiner.is_taken_back:
+                say(TAKEN_BACK)
 
     def _correct_poses(self) -> None:
         """Applies the current corrections of the poses to the rays and to the held-out frames."""

@@ -78,6 +78,13 @@ PAIRS = 256
 MEMORY = 0.9
 """Weight of earlier looks after each correction of the poses."""
 
+STEADY_LOOKS = 30
+"""Number of looks over which the squared error of pairs is averaged, before it is compared with earlier ones."""
+
+FITS_WORSE = 1.5
+"""Increase of that error over its smallest value at which corrections are taken back. Where corrections find the right
+poses, it stays below 1.25."""
+
 SURE, STAYS = 9.0, 3.0
 """Decrease of the squared error, in units of its variance and beyond chance, that begins the correction of a part, and
 that keeps it."""
@@ -186,6 +193,16 @@ class PoseRefiner(nn.Module):
     """Right side of the normal equations."""
     looks: Tensor
     """Number of looks so far."""
+    error: Tensor
+    """Squared error of pairs, squared thresholds, averaged over the last looks."""
+    least_error: Tensor
+    """Smallest such error so far."""
+    best_value: Tensor
+    """The numbers of that time, in their units."""
+    best_corrected: Tensor
+    """The parts that were corrected at that time."""
+    is_taken_back: Tensor
+    """Whether later corrections were taken back, because events fitted them worse. No further ones follow."""
 
     def __init__(self, config: RefinerConfig, recording: EventRecording):
         super().__init__()
@@ -253,6 +270,11 @@ class PoseRefiner(nn.Module):
                 self.value[number] = self._expected[number] = start / unit
                 self._before[number, number] = (unit / STARTS_WITHIN[part]) ** 2
                 self.is_corrected[list(self.parts).index(part)] = True
+        self.register_buffer("error", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("least_error", torch.full((), math.inf, dtype=torch.float64))
+        self.register_buffer("best_value", self.value.clone())
+        self.register_buffer("best_corrected", self.is_corrected.clone())
+        self.register_buffer("is_taken_back", torch.zeros((), dtype=torch.bool))
 
     @property
     def units(self) -> dict[Part, Float64[np.ndarray, " numbers"]]:
@@ -319,6 +341,7 @@ class PoseRefiner(nn.Module):
         self.normal += torch.from_numpy(weighted.T @ changes)
         self.right += torch.from_numpy(weighted.T @ residual)
         self.looks += 1
+        self.error += (variance - self.error) / min(int(self.looks), STEADY_LOOKS)
 
     def _columns(
         self,
@@ -380,6 +403,8 @@ class PoseRefiner(nn.Module):
         Raises:
             RecordingError: A correction exceeds `LIMITS`.
         """
+        if self._fits_worse():
+            return True
         systematic = SYSTEMATIC * max(1.0, SETTLED_AFTER / step)
         believed = 1.0 / (1.0 + systematic**2 * self._information_a_radian)
         normal, right = believed * self.normal.numpy(), believed * self.right.numpy()
@@ -410,6 +435,18 @@ class PoseRefiner(nn.Module):
         self.normal *= MEMORY
         self._check()
         return True
+
+    def _fits_worse(self) -> bool:
+        """Whether events fit the corrections much worse than the best ones before, which then come back."""
+        if self.error < self.least_error:
+            self.least_error.copy_(self.error)
+            self.best_value.copy_(self.value)
+            self.best_corrected.copy_(self.is_corrected)
+        elif self.error > FITS_WORSE * self.least_error and not torch.equal(self.value, self.best_value):
+            self.value.copy_(self.best_value)
+            self.is_corrected.copy_(self.best_corrected)
+            self.is_taken_back.fill_(True)
+        return bool(self.is_taken_back)
 
     def _change_of_noise(self, change: Float64[np.ndarray, " whole"]) -> Float64[np.ndarray, " numbers"]:
         """The change of the noise after all other numbers have changed.

@@ -269,6 +269,18 @@ def test_what_turns_out_to_be_right_is_taken_back_at_once():
     assert refiner.corrected == [] and refiner.corrections.delay == 0.0
 
 
+def test_corrections_that_events_fit_worse_are_taken_back():
+    """As where a field has followed a correction to where it cannot render the scene."""
+    refiner = PoseRefiner(RefinerConfig(), recording())
+    solved(refiner, {"clock": [4.0]})
+    assert not refiner.is_taken_back
+    for number in range(10):
+        looks(refiner, {"clock": [30.0], "rotation": np.radians([0.8, -0.5, 0.3])}, 0.3, 6, number)
+        refiner.solve(400)
+    assert refiner.is_taken_back and refiner.corrected == ["clock"]
+    np.testing.assert_allclose(found(refiner, "clock"), [4.0], atol=0.4)
+
+
 def test_flags_force_and_forbid():
     refiner = PoseRefiner(RefinerConfig(refine_clock=False, refine_lens=True), recording())
     assert refiner.corrected == ["lens"] and "clock" not in refiner.allowed
