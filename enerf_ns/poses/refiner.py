@@ -82,8 +82,7 @@ STEADY_LOOKS = 30
 """Number of looks over which the squared error of pairs is averaged, before it is compared with earlier ones."""
 
 FITS_WORSE = 1.5
-"""Increase of that error over its smallest value at which corrections are taken back. Where corrections find the right
-poses, it stays below 1.25."""
+"""Increase of that error over its smallest value at which corrections are taken back."""
 
 SURE, STAYS = 9.0, 3.0
 """Decrease of the squared error, in units of its variance and beyond chance, that begins the correction of a part, and
@@ -95,7 +94,8 @@ reduce: 0.01 pixels of a sensor with 160 pixels over 60 degrees. A field is not 
 it learns from as many pairs."""
 
 SETTLED_AFTER = 200.0
-"""Step before which that error is larger, in inverse proportion to the step."""
+"""Step before which that error is larger, in inverse proportion to the step. Before it, the squared error of pairs may
+grow with right corrections, too, since the field first shows nothing."""
 
 FINEST_SLOPES = math.radians(0.6)
 """Angle (radians) that the smallest cells of the hash grid whose slopes count take up at a usual distance. Poses are
@@ -403,7 +403,7 @@ class PoseRefiner(nn.Module):
         Raises:
             RecordingError: A correction exceeds `LIMITS`.
         """
-        if self._fits_worse():
+        if step >= SETTLED_AFTER and self._fits_worse():
             return True
         systematic = SYSTEMATIC * max(1.0, SETTLED_AFTER / step)
         believed = 1.0 / (1.0 + systematic**2 * self._information_a_radian)
