@@ -304,10 +304,10 @@ class EnerfPipeline(VanillaPipeline):
         """Observes the errors of the poses at some pairs of a training step, and corrects the poses now and then."""
         may_begin = step < BEGINS_UNTIL * self.num_steps
         every = LOOK_AGAIN_EVERY if refiner.corrected and may_begin else LOOK_EVERY
-        if refiner.is_taken_back or not (refiner.corrected or may_begin):
-            return  # nothing will be corrected any more
         if not refiner.allowed or step < FIRST_STEP or step >= FROZEN_FROM * self.num_steps or step % every:
             return
+        if refiner.is_taken_back or not (refiner.corrected or may_begin):
+            return  # nothing will be corrected any more
         manager, sensor, model = self.datamanager, self.model.sensor, self.model
         fired = batch.fired.stop
         chosen = torch.zeros(len(batch), dtype=torch.bool)

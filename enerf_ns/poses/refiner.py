@@ -271,7 +271,7 @@ class PoseRefiner(nn.Module):
                 self._before[number, number] = (unit / STARTS_WITHIN[part]) ** 2
                 self.is_corrected[list(self.parts).index(part)] = True
         self.register_buffer("error", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("least_error", torch.full((), math.inf, dtype=torch.float64))
+        self.register_buffer("least_error", torch.tensor(torch.finfo(torch.float64).max, dtype=torch.float64))
         self.register_buffer("best_value", self.value.clone())
         self.register_buffer("best_corrected", self.is_corrected.clone())
         self.register_buffer("is_taken_back", torch.zeros((), dtype=torch.bool))
