@@ -89,6 +89,10 @@ EXPLAINED = 1.1
 of 16 simulated recordings and slider_depth, 1.07 for one of them at half its resolution, and 1.14 or more for wrong
 readings and poses of another time. Strong edges make it 2 for right poses, too."""
 
+STRUCTURED = 1.5
+"""Smallest mean free sharpness of windows whose events follow a motion. Where events lie at random places, it is 1.2 to
+1.4, since free motion finds more by chance than poses do."""
+
 LONGER_WINDOWS = (1.0, 4.0, 16.0)
 """Multiples of the assumed depth of the scene that are tried until the readings of the poses differ clearly. With too
 small a depth, which wrong poses often show, windows are too short for that."""
@@ -240,6 +244,8 @@ def is_in_focus(recording: EventRecording, distance: float) -> bool:
     others, as_stated = [trials.height(Hypothesis(delay)) for delay in delays], heights[AS_READ]
     if not (is_clear or focus.has_strong_edges or _is_as_sharp_as_can_be(focus, as_stated, others)):
         return False
+    if _is_unsharp(focus, max(as_stated, *others)):
+        return False
     if focus.turn >= SMALLEST_TURN:
         others += [trials.height(Hypothesis(focal_scale=lens)) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
     return all(other < LENS_GAIN * as_stated for other in others)
@@ -256,6 +262,15 @@ def _is_as_sharp_as_can_be(focus: EventFocus, as_stated: float, delayed: list[fl
         delayed: Sharpness with each of `SHOWN_DELAYS`.
     """
     return focus.free_sharpness < EXPLAINED * as_stated and ALIKE * max(delayed, default=0.0) < as_stated
+
+
+def _is_unsharp(focus: EventFocus, sharpest: float) -> bool:
+    """Whether free motion makes the events much sharper than the best of some hypotheses, and not by chance.
+
+    Poses with a drift of several pixels are so, although other readings of them may be clearly less sharp.
+    """
+    least = max(EXPLAINED * sharpest, STRUCTURED * len(focus.windows))
+    return not focus.chance and focus.free_sharpness >= least
 
 
 def clock_of_frames(recording: EventRecording, depth_range: tuple[float, float]) -> Estimate | None:
@@ -396,8 +411,8 @@ class Agreement:
         """Names of the values that this recording does not identify."""
         delays = {"the clock of the poses": self.pose_delay, "the clock of the frames": self.frame_delay}
         unknown = [what for what, delay in delays.items() if delay is not None and not delay.is_identifiable]
-        by_frames = self.corners is not None and self.corners.focal_scale.is_identifiable and self._is_one_camera
-        return unknown + ["the focal length"] * (not self.focal_scale.is_identifiable and not by_frames)
+        is_unknown = not self.focal_scale.is_identifiable and self._by_frames is None
+        return unknown + ["the focal length"] * is_unknown
 
     def unknown(self) -> list[OpenQuestion]:
         """Questions that the search leaves open. None if it found a problem."""
@@ -456,18 +471,20 @@ class Agreement:
     def problems(self) -> list[Problem]:
         """Contradictions between recording and events, the gravest first."""
         focal = list(self._focal_problems())
-        if focal and not FOCAL_SCALES[0] <= self.focal_scale.value <= FOCAL_SCALES[-1]:
+        is_unsharp = _is_unsharp(self.focus, max(self.sharpness.values()))
+        if focal and not FOCAL_SCALES[0] <= self.focal_scale.value <= FOCAL_SCALES[-1] and not is_unsharp:
             return focal  # with the calibration of another lens, poses and clocks do not fit either
-        if not self.is_clear and self._why_open:
-            return [*self._pose_problems()]
-        if not self.is_clear:
+        if is_unsharp or not (self.is_clear or self._why_open):
             return [
                 Problem(
                     "No reading of the poses makes the events sharp, with any delay of their clock within "
-                    f"{self.focus.largest_delay * 1e-6:.0f} ms: poses and events do not belong together.",
+                    f"{self.focus.largest_delay * 1e-6:.0f} ms or any focal length: poses and events do not belong "
+                    "together, or the poses drift.",
                     "Check that the poses are those of this recording, the unit of their times, and the calibration.",
                 )
             ]
+        if not self.is_clear:
+            return [*self._pose_problems()]
         of_frames = [] if focal and self._is_one_camera else self._frame_focal_problems()
         return [*self._pose_problems(), *self._clock_problems(), *focal, *of_frames]
 
@@ -533,8 +550,8 @@ class Agreement:
         )
 
     def _focal_problems(self) -> Iterator[Problem]:
-        scale = self.focal_scale
-        if _is_wrong(scale):
+        scale, by_frames = self.focal_scale, self._by_frames
+        if _is_wrong(scale) and (by_frames is None or _is_wrong(by_frames)):
             yield Problem(
                 f"The focal length is wrong: {scale.value:.3f} ± {scale.error:.3f} of the stated one fits the events "
                 f"best, {scale.value * self.focus.recording.camera.fx:.1f} pixels.",
@@ -553,6 +570,13 @@ class Agreement:
                 f"{fit.least_error:.1f} pixels, and {fit.error:.1f} pixels with the stated one.",
                 "Check the calibration, and whether it is of this lens and the resolution of these frames.",
             )
+
+    @property
+    def _by_frames(self) -> Estimate | None:
+        """The focal length that frames of the same camera identify, better than events do; None if they do not."""
+        if self.corners is None or not self._is_one_camera or not self.corners.focal_scale.is_identifiable:
+            return None
+        return self.corners.focal_scale
 
     @property
     def _is_one_camera(self) -> bool:

@@ -47,15 +47,24 @@ class Verdict:
         return SHORT[self.explained]
 
 
-def verdict_on_events(scores: Mapping[str, Any], num_pairs: int, steps: int, cause: str, recording: Path) -> Verdict:
+def verdict_on_events(
+    scores: Mapping[str, Any],
+    num_pairs: int,
+    steps: int,
+    cause: str,
+    recording: Path,
+    in_spite_of_corrections: bool = False,
+) -> Verdict:
     """The verdict by the scores of held-out events.
 
     Args:
         scores: The `enerf_ns.evaluation.metrics.event_scores`, each a number or a reason.
         num_pairs: Number of different pairs of events that were scored.
         steps: Number of training steps done.
-        cause: Likely cause that was found before training, as a clause with advice; empty if there is none.
+        cause: Likely cause why events are not explained, as a clause with advice; empty if there is none.
         recording: Folder of the recording.
+        in_spite_of_corrections: Whether the cause was found with the poses, clock and lens that training corrected. The
+            events are then explained in part at best.
     """
     correlation, sign = scores.get("event_correlation", "no events were scored"), scores.get("event_sign")
     if isinstance(correlation, str):
@@ -67,9 +76,11 @@ def verdict_on_events(scores: Mapping[str, Any], num_pairs: int, steps: int, cau
     if isinstance(sign, (int, float)):
         share, right = f", and {100 * sign:.0f} % have the same sign", float(sign)
     found = f"at held-out events, rendered and measured changes of brightness correlate at {correlation:.2f}{share}"
-    if correlation >= HIGH_CORRELATION or right >= HIGH_SIGN:
+    if (correlation >= HIGH_CORRELATION or right >= HIGH_SIGN) and not in_spite_of_corrections:
         return _verdict("yes", f": {found}.")
-    if cause:
+    if in_spite_of_corrections:
+        advice = f"The corrections of clock, poses and lens do not suffice: {cause}."
+    elif cause:
         advice = f"The likely cause: {cause}."
     elif steps < FEW_STEPS:
         rest = f", because {steps} steps are too few ({found}); train longer with --max-num-iterations."

@@ -317,7 +317,7 @@ class EnerfTrainerConfig(TrainerConfig):
             if self.verbose:
                 CONSOLE.print(Text(choices_text(resolution.choices, columns())), soft_wrap=True)
             if resolution.cause:
-                say(f"Training will hardly explain the events, because {resolution.cause}.")
+                say(f"Training may fail to explain the events, because {resolution.cause}.")
             folder = config.get_base_dir()
             files = {
                 "config.yml": yaml.dump(config),

@@ -64,3 +64,13 @@ def test_what_scores_do_not_tell_is_unknown(scores: dict[str, float | str], pair
 def test_a_sign_that_is_missing_does_not_count():
     found = verdict_on_events({"event_correlation": 0.1, "event_sign": "no pair"}, 2000, 1000, "", PATH)
     assert found.explained == "no" and "sign" not in found.sentence and shlex.quote("a folder") in found.sentence
+
+
+@pytest.mark.parametrize(("correlation", "sign", "explained"), [(0.79, 0.9, "partly"), (0.1, 0.5, "no")])
+def test_poses_that_do_not_fit_although_they_were_corrected_explain_in_part_at_best(
+    correlation: float, sign: float, explained: str
+):
+    scores = {"event_correlation": correlation, "event_sign": sign}
+    found = verdict_on_events(scores, 2000, 3000, CAUSE, PATH, in_spite_of_corrections=True)
+    assert found.explained == explained and f"{correlation:.2f}" in found.sentence
+    assert found.sentence.endswith(f"The corrections of clock, poses and lens do not suffice: {CAUSE}.")

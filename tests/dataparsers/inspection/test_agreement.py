@@ -18,7 +18,7 @@ from enerf_ns.bench.numerics.points import PHASE, TURNING, points_between, shaki
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.inspection import agreement as agreement_module
-from enerf_ns.dataparsers.inspection.agreement import Agreement, is_in_focus, usual_depth
+from enerf_ns.dataparsers.inspection.agreement import Agreement, CornerFit, Estimate, is_in_focus, usual_depth
 from enerf_ns.dataparsers.inspection.page import Inspection
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -105,6 +105,16 @@ def test_the_best_focal_length_is_the_true_one(factor: float):
     found = agreement(faults.longer_focal_length(points_seen(shaking(0.1), turning), factor))
     assert found.focal_scale.is_identifiable and found.focal_scale.value == pytest.approx(1 / factor, abs=0.02)
     assert "focal length is wrong" in words(found)
+
+
+@pytest.mark.parametrize("by_frames", [1.0, 1 / 1.1])
+def test_frames_of_the_same_camera_know_better_whether_the_focal_length_is_wrong(by_frames: float):
+    """Where the parallax is weak, the sharpest focal length of events may be off by 5 % in spite of right poses."""
+    found = agreement(faults.longer_focal_length(points_seen(shaking(0.1), TURNING), 1.1))
+    corners = CornerFit(found.focus.recording.camera, Estimate(by_frames, 0.002, True), 0.5, 0.1)
+    assert [problem.what[:16] for problem in found.problems()] == ["The focal length"]
+    named = [problem.what[:16] for problem in replace(found, corners=corners).problems()]
+    assert named == ["The focal length"] * (by_frames != 1.0)
 
 
 @pytest.mark.parametrize("turn", [1.0, 2.5])
@@ -222,6 +232,19 @@ def test_a_slide_with_the_poses_of_structure_from_motion_agrees_with_its_events(
 def test_poses_of_another_recording_bring_nothing_into_focus(shaken: EventRecording):
     other = Trajectory(shaken.trajectory.times, shaking(0.1)[::-1] @ np.eye(3)[[1, 2, 0]], TURNING[::-1].as_quat())
     assert "No reading of the poses" in words(agreement(faults.with_poses(shaken, other)))
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_poses_that_drift_far_agree_with_no_event(shaken: EventRecording, seed: int):
+    """Other readings of them are clearly less sharp, and with one seed another lens is sharper."""
+    generator, now, read = np.random.default_rng(seed), np.linspace(0, 1, 2000), shaken.trajectory
+    knots = np.linspace(0, 1, 6), generator.normal(size=(6, 3)), generator.normal(size=(6, 3))
+    shift, turn = (CubicSpline(knots[0], of_knots)(now) for of_knots in knots[1:])
+    turned = Rotation.from_quat(read.quaternions) * Rotation.from_rotvec(np.radians(2.0) * turn)
+    drifting = faults.with_poses(shaken, Trajectory(read.times, read.positions + 0.04 * shift, turned.as_quat()))
+    found = agreement(drifting)
+    assert found.is_clear and "No reading of the poses" in words(found)
+    assert is_in_focus(shaken, 2.0) and not is_in_focus(drifting, 2.0)
 
 
 def test_few_events_say_nothing(tmp_path: Path):
