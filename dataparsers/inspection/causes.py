@@ -49,19 +49,31 @@ def why_not_explained(
         depth_range: Nearest and farthest depth of the scene, metres.
         as_read: The recording without corrections of poses and calibration, in which the cause is searched.
     """
+    return why_poses_do_not_fit(recording, depth_range, as_read) or why_depths_do_not_fit(recording, depth_range)
+
+
+def why_poses_do_not_fit(
+    recording: EventRecording, depth_range: tuple[float, float], as_read: EventRecording
+) -> str | None:
+    """The contradiction of poses, clock or focal length with the events, as `why_not_explained` has it."""
     near, far = depth_range
-    if not is_in_focus(recording, math.sqrt(near * far)):
-        found = _contradiction(as_read, depth_range)
-        if found is not None:
-            return f"{in_a_clause(found)}; enerf inspect {quoted(recording.path)} shows this"
+    if is_in_focus(recording, math.sqrt(near * far)):
+        return None
+    found = _contradiction(as_read, depth_range)
+    return None if found is None else f"{in_a_clause(found)}; enerf inspect {quoted(recording.path)} shows this"
+
+
+def why_depths_do_not_fit(recording: EventRecording, depth_range: tuple[float, float]) -> str | None:
+    """The contradiction of a depth range (m) with the parallax of the events, as `why_not_explained` has it."""
+    near, far = depth_range
     parallax = recording_parallax(recording)
-    if parallax.contradicts(depth_range):
-        shown = "{:.3g} m to {:.3g} m".format(*parallax.depth_range)
-        return (
-            f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; leave out "
-            "--depth-range, or state it in the unit of the poses"
-        )
-    return None
+    if not parallax.contradicts(depth_range):
+        return None
+    shown = "{:.3g} m to {:.3g} m".format(*parallax.depth_range)
+    return (
+        f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; leave out "
+        "--depth-range, or state it in the unit of the poses"
+    )
 
 
 def _contradiction(recording: EventRecording, depth_range: tuple[float, float] | None) -> Problem | None:

@@ -17,7 +17,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.colormaps import apply_depth_colormap
 from torch import Tensor
 
-from enerf_ns.dataparsers.inspection.causes import why_not_explained
+from enerf_ns.dataparsers.inspection.causes import why_depths_do_not_fit, why_poses_do_not_fit
 from enerf_ns.dataparsers.recording.errors import UserError, printable
 from enerf_ns.dataparsers.recording.files import write_whole
 from enerf_ns.evaluation.history import HistoryRow, append_row, cut_history
@@ -284,10 +284,11 @@ class ErrorAgainstTime:
         if "events" not in manager.config.supervision:
             return
         pairs, recording, poses = self.pipeline.num_scored_pairs, manager.recording, self.pipeline.poses
-        cause, is_anew = config.resolution.cause, final and poses is not None and bool(poses.corrected)
-        if cause and is_anew:
-            cause = why_not_explained(recording, manager.depth_range, recording) or ""
-        self.verdict = verdict_on_events(scores, pairs, done, cause, recording.path, bool(cause) and is_anew)
+        cause, left = config.resolution.cause, None
+        if cause and final and poses is not None and poses.corrected:
+            left = why_poses_do_not_fit(recording, manager.depth_range, recording)
+            cause = left or why_depths_do_not_fit(recording, manager.depth_range) or ""
+        self.verdict = verdict_on_events(scores, pairs, done, cause, recording.path, left is not None)
         if self.verdict.explained == "no" and not final and done >= FEW_STEPS and not self._is_said:
             self._is_said = True
             say(f"Step {done}: {self.verdict.sentence}")
