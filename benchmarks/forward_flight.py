@@ -17,6 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from threshold import LEARNT_FROM, shown
 
+from enerf_ns.bench.runner import made_whole
 from enerf_ns.bench.validation import KEYS_PER_SECOND, ONLY_SCORED
 from enerf_ns.evaluation.scores import mean_scores
 from enerf_ns.evaluation.views import HeldOutView, aligned_views
@@ -44,8 +45,9 @@ def main() -> None:
     rows = []
     for name, sequence in recordings.items():
         folder = arguments.work / name.replace(" ", "-")
-        if not (folder / "recording").exists():
-            simulate(sequence.simulation_settings(folder), folder / "recording")
+        with made_whole(folder / "recording") as new:
+            if new is not None:
+                simulate(sequence.simulation_settings(folder), new)
         for learnt_from, supervision in LEARNT_FROM.items():
             changes = {"max_num_iterations": arguments.steps, "evaluation_share": 0.0, **supervision}
             found = []

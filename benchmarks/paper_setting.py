@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from threshold import shown
 
 from enerf_ns.evaluation.scores import mean_scores
 from enerf_ns.method.held_out_views import held_out_views
@@ -81,8 +82,8 @@ def main() -> None:
                 print(f"seed {seed}, {name}: steps, seconds, dB: {found[-1]}", flush=True)
     print("\n| method | steps | s | PSNR, dB |\n| --- | --- | --- | --- |")
     for name, found in rows.items():
-        steps, seconds, mean = np.mean(found, axis=0)
-        print(f"| {name} | {steps:.0f} | {seconds:.0f} | {mean:.2f} ± {np.std([row[2] for row in found]):.2f} |")
+        steps, seconds, _ = np.mean(found, axis=0)
+        print(f"| {name} | {steps:.0f} | {seconds:.0f} | {shown([row[2] for row in found], 2)} |")
 
 
 if __name__ == "__main__":

@@ -124,20 +124,21 @@ def main() -> None:
 
 def right_poses(name: str, work: Path) -> Path:
     """The recording in the layout event_recording, simulated once."""
+    from enerf_ns.bench.runner import made_whole
     from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
     from enerf_ns.simulator.engine import simulate
     from enerf_ns.simulator.event_sensor import SensorSettings
     from enerf_ns.simulator.settings import SimulationSettings
 
     folder = work / name / "right"
-    if folder.exists():
-        return folder
     sequence = (CHOSEN_ON | ONLY_SCORED).get(name)
     if sequence is None:
         settings = SimulationSettings(name, layout="event_recording")
     else:
         settings = sequence.simulation_settings(work / name, layout="event_recording", sensor=SensorSettings())
-    simulate(settings, folder)
+    with made_whole(folder) as new:
+        if new is not None:
+            simulate(settings, new)
     return folder
 
 

@@ -78,6 +78,7 @@ REFINEMENT = re.compile(
 )
 """The mark of a table of wrong poses: what it shows, its recordings and its faults, with spaces between."""
 
+KEYS = "recording", "fault", "steps"
 OF_REFINEMENT = {"scores": scores_by_fault, "found": found_by_fault}
 
 FIGURE_WIDTH = 1250
@@ -126,8 +127,11 @@ def scores(rows: list[str], places: list[str]) -> str:
 
 def refinement(shown: str, recordings: list[str], faults: list[str], steps: int) -> str:
     """A table of wrong poses from the committed trainings of benchmarks/pose_refinement.py."""
-    trained = (RESULTS / "pose-refinement.jsonl").read_text().splitlines()
-    return OF_REFINEMENT[shown]([json.loads(line) for line in trained], recordings, faults, steps)
+    trained = map(json.loads, (RESULTS / "pose-refinement.jsonl").read_text().splitlines())
+    kinds = recordings, faults, [steps]
+    runs = [run for run in trained if all(run[key] in kind for key, kind in zip(KEYS, kinds, strict=True))]
+    versions = " and ".join(sorted({run["version"] for run in runs}))
+    return f"{OF_REFINEMENT[shown](runs, recordings, faults, steps)}\n\nThe trainings are of version {versions}."
 
 
 def pictures(bench: Bench) -> dict[str, dict[str, Path]]:
@@ -187,7 +191,10 @@ def write_views(name: str, bench: Bench, folder: Path) -> None:
 def merged(*files: Path) -> dict[str, Any]:
     """The contents of the last of some result files that are there, with the trainings of all."""
     found = [json.loads(file.read_text()) for file in files if file.exists()]
-    runs = {run["inputs"]: run for results in found for run in results["runs"]}
+    runs: dict[str, dict[str, Any]] = {}
+    for run in (run for results in found for run in results["runs"]):
+        if "failure" not in run or run["inputs"] not in runs:
+            runs[run["inputs"]] = run
     return {**found[-1], "runs": list(runs.values())}
 
 

@@ -14,6 +14,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from enerf_ns.bench.runner import made_whole
 from enerf_ns.bench.validation import CHOSEN_ON, ONLY_SCORED
 from enerf_ns.evaluation.scores import mean_scores
 from enerf_ns.evaluation.views import aligned_views
@@ -61,8 +62,9 @@ def main() -> None:
 def recording(name: str, threshold: float, work: Path) -> Path:
     """Folder of a recording of the validation set, simulated once with both thresholds changed."""
     folder = work / f"{name}-{threshold:g}"
-    if not folder.exists():
-        simulate(IDEAL[name].simulation_settings(work, contrast_thresholds=(threshold, threshold)), folder)
+    with made_whole(folder) as new:
+        if new is not None:
+            simulate(IDEAL[name].simulation_settings(work, contrast_thresholds=(threshold, threshold)), new)
     return folder
 
 

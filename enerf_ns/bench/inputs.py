@@ -11,50 +11,65 @@ from pathlib import Path
 import enerf_ns
 import enerf_ns.dataparsers
 
-ROOTS = (
+SIMULATION = (
+    "enerf_ns.simulator.engine",
+    "enerf_ns.dataparsers.formats.esim",
+    "enerf_ns.dataparsers.formats.event_recording",
+)
+"""Modules that make the recordings of the experiments. All that they import counts, too."""
+
+RECONSTRUCTION = "enerf_ns.reconstruction.reconstruction"
+"""Module that makes frames of events."""
+
+TRAINING = (
     "enerf_ns.method.config",
     "enerf_ns.method.runs",
     "enerf_ns.bench.measures",
     "enerf_ns.kernels.fast_hash_encoding",
     "enerf_ns.kernels.hash_grid_triton",
-    "enerf_ns.simulator.engine",
-    "enerf_ns.reconstruction.reconstruction",
-    "enerf_ns.dataparsers.formats.event_recording",
+    *SIMULATION,
+    RECONSTRUCTION,
 )
-"""Modules that a training calls. All that they import counts, too."""
+"""Modules that the training of a simulated recording calls."""
+
+ALL_READERS = "enerf_ns.dataparsers.formats.registry"
+"""Module that imports the readers of all formats, for recordings of the user."""
+
+NUMERICAL_ERRORS = "enerf_ns.bench.numerics.parts"
+"""Module that measures the numerical errors of the parts."""
 
 LEFT_OUT = (
     "enerf_ns.bench.experiments",
     "enerf_ns.bench.numerics",
-    "enerf_ns.dataparsers.formats.registry",
+    ALL_READERS,
     "enerf_ns.method.viewer",
     "enerf_ns.report",
 )
-"""Modules and packages that change no result: experiments, whose settings count by themselves; readers of other
-formats; viewer and reports."""
+"""Modules and packages that change no result where others import them: experiments, whose settings count by themselves;
+numerical checks; readers of other formats; viewer and reports."""
 
 LARGEST_HASHED = 16_000_000
 """Size in bytes up to which the content of a file of a recording counts, and not only its name and size."""
 
 
 @cache
-def code_digest() -> str:
-    """A short name for the code of a training, without its comments and docstrings."""
+def code_digest(*roots: str) -> str:
+    """A short name for the code of some modules and all that they import, without comments and docstrings."""
     found = hashlib.sha256()
-    for name in sorted(modules(ROOTS)):
+    for name in sorted(modules(roots)):
         found.update(f"{name} {ast.dump(_without_docstrings(_parsed(name)))}".encode())
     return found.hexdigest()[:10]
 
 
 def modules(roots: Iterable[str]) -> set[str]:
-    """Names of the modules of this package that some modules import, at any level, and of these."""
-    found: set[str] = set()
-    to_do = list(roots)
+    """Names of these modules, and of the modules of this package that they import at any level, if not `LEFT_OUT`."""
+    found = set(roots)
+    to_do = list(found)
     while to_do:
-        name = to_do.pop()
-        if name not in found and not any(name == out or name.startswith(f"{out}.") for out in LEFT_OUT):
-            found.add(name)
-            to_do += _imported(_parsed(name))
+        imported = _imported(_parsed(to_do.pop())) - found
+        new = {name for name in imported if not any(name == out or name.startswith(f"{out}.") for out in LEFT_OUT)}
+        found |= new
+        to_do += new
     return found
 
 

@@ -23,7 +23,15 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from enerf_ns.bench.diagram import diagram
 from enerf_ns.bench.experiments import EXPERIMENTS, ROWS, SEQUENCES, Experiment, known_sensor
-from enerf_ns.bench.inputs import code_digest, recording_digest
+from enerf_ns.bench.inputs import (
+    ALL_READERS,
+    NUMERICAL_ERRORS,
+    RECONSTRUCTION,
+    SIMULATION,
+    TRAINING,
+    code_digest,
+    recording_digest,
+)
 from enerf_ns.bench.measures import TRUTH, evaluate
 from enerf_ns.bench.numerics.parts import error_of_parts
 from enerf_ns.bench.settings import BenchSettings
@@ -88,6 +96,8 @@ class Bench:
         there = experiment.recorded if of_data else experiment.sequences
         if experiment.beside and of_data:
             there = (*experiment.sequences, *experiment.recorded)
+        self.all_sequences = there
+        """Sequences that the experiment could have with these recordings."""
         self.sequences = _some("sequences", settings.sequences, there)
         rows = _some("rows", settings.rows, experiment.rows)
         self.left_out = {
@@ -174,6 +184,7 @@ class Bench:
             "columns": experiment.columns,
             "protocols": experiment.protocols,
             "mean": experiment.mean,
+            "sequences": self.all_sequences,
             "published": {
                 sequence: {row: scores for row, scores in rows.items() if row not in not_asked}
                 for sequence, rows in experiment.published.items()
@@ -232,13 +243,18 @@ class Bench:
         row, sequence, settings = ROWS[cell.row], SEQUENCES[cell.sequence], self.settings
         simulation = self._simulation(cell)
         weights = settings.reconstruction_weights if row.reconstruction == "e2vid" else None
+        if simulation is None:
+            recording = recording_digest(self._recorded(cell))
+        else:
+            recording = [simulation, sequence.files, code_digest(*SIMULATION)]
+        code = [*TRAINING, *([ALL_READERS] * (simulation is None)), *([NUMERICAL_ERRORS] * self.experiment.parts)]
         about = {
             "method": self._method(cell),
             "changes": self._changes(cell),
             "factors": row.factors,
             "preset": sequence.preset,
-            "code": code_digest(),
-            "recording": recording_digest(self._recorded(cell)) if simulation is None else [simulation, sequence.files],
+            "code": code_digest(*code),
+            "recording": recording,
             "reconstruction": row.reconstruction,
             "weights": weights and hashlib.sha256(expanded(weights).read_bytes()).hexdigest(),
             "budget": self._budget(cell),
@@ -267,11 +283,11 @@ class Bench:
     def _finished(self, cell: Cell) -> dict[str, Any] | None:
         """The stored result of a cell with the same inputs: of its run, or in the result file, which may come from
         another machine. None if there is none or the training failed."""
-        try:
-            result = json.loads((self.folder(cell) / RESULT).read_text())
-        except (OSError, ValueError):
-            result = self._stored.get(_digest(self._about(cell)))
-        return None if result is None or "failure" in result else result
+        found = [self._stored.get(_digest(self._about(cell)))]
+        with contextlib.suppress(OSError, ValueError):
+            found.insert(0, json.loads((self.folder(cell) / RESULT).read_text()))
+        finished = (result for result in found if result is not None and "failure" not in result)
+        return next(({**result, **asdict(cell)} for result in finished), None)
 
     def _attempt(self, cell: Cell) -> dict[str, Any]:
         """Trains and scores a cell, and stores its result or its failure."""
@@ -344,8 +360,9 @@ class Bench:
             recording = self._recorded(cell)
         else:
             stem = f"{Path(simulation['scene']).stem}-{simulation['width']}x{simulation['height']}"
-            recording = self.output_dir / "recordings" / f"{stem}-{_digest([simulation, sequence.files])}"
-            with _made_whole(recording) as folder:
+            made_of = _digest(self._about(cell)["recording"])
+            recording = self.output_dir / "recordings" / f"{stem}-{made_of}"
+            with made_whole(recording) as folder:
                 if folder is not None:
                     size = {name: simulation[name] for name in ("width", "height")}
                     with self._writing_to(recording.parent):
@@ -359,9 +376,9 @@ class Bench:
 
         weights = self.settings.reconstruction_weights if row.reconstruction == "e2vid" else None
         about = self._about(cell)
-        of = _digest([about["recording"], row.reconstruction, about["weights"]])
-        frames = self.output_dir / "recordings" / f"{cell.sequence}-{row.reconstruction}-{of}"
-        with _made_whole(frames) as folder:
+        made_of = _digest([about["recording"], row.reconstruction, about["weights"], code_digest(RECONSTRUCTION)])
+        frames = self.output_dir / "recordings" / f"{cell.sequence}-{row.reconstruction}-{made_of}"
+        with made_whole(frames) as folder:
             if folder is not None:
                 reconstruct(recording, folder, weights and expanded(weights))
         return frames
@@ -400,6 +417,8 @@ def _results_of(against: Path | None, conditions: dict[str, Any]) -> dict[str, A
     if not table:
         raise FlagError(f"--against {against} holds no runs; give a result file (.json) that has some.")
     for what, value in conditions.items():
+        if what == "scale" and None in (value, found.get(what)):
+            continue  # on recordings of the user, which have one size
         if found.get(what) != value:
             raise FlagError(
                 f"--against {against} has results of {what} {found.get(what)}, but this bench has {what} {value}; "
@@ -480,7 +499,7 @@ def _digest(about: Any) -> str:
 
 
 @contextlib.contextmanager
-def _made_whole(folder: Path) -> Iterator[Path | None]:
+def made_whole(folder: Path) -> Iterator[Path | None]:
     """A new folder beside one that is to be made, which it becomes at the end; None where that one is there."""
     if folder.exists():
         yield None

@@ -71,18 +71,23 @@ class Line:
 
 
 def lines(results: Results) -> list[Line]:
-    """The lines of the table by sequence: first the rows of the experiment, then rows that are only published."""
+    """The lines of the table by sequence: first the rows of the experiment, then rows that are only published.
+
+    A mean over a part of the sequences is named by them, and has no published scores beside it.
+    """
     runs, published = results["runs"], results["published"]
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     rows = list(dict.fromkeys(run["row"] for run in runs))
     of_reference = _reference_seconds(results)
+    missing = set(results.get("sequences", sequences)).difference(sequences)
+    of_mean = f"{MEAN} of {', '.join(sequences)}" if missing else MEAN
     blocks = [] if results["mean"] else [[sequence] for sequence in sequences]
     if results["mean"] or MEAN in published:
         blocks.append(sequences)
     found = []
     for number, block in enumerate(blocks):
         is_mean = results["mean"] or number == len(sequences)
-        name = MEAN if is_mean else block[0]
+        name = of_mean if is_mean else block[0]
         of_block = published.get(name, {})
         for row in rows:
             for place, protocol in enumerate(results["protocols"]):
@@ -148,11 +153,22 @@ class Change:
 
 
 def changes_since(results: Results, before: Results) -> list[Change]:
-    """The change of each row that both results have, largest loss first."""
-    then = {(line.sequence, line.row): line.scores["psnr"] for line in lines(before) if line.scores.get("psnr")}
-    now = {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
+    """The change of each row on the sequences that both results have, largest loss first."""
+    sequences = {run["sequence"] for run in results["runs"]} & {run["sequence"] for run in before["runs"]}
+    whole = results.get("sequences", [*sequences])
+    then, now = (_psnr_of_rows({**_of_sequences(one, sequences), "sequences": whole}) for one in (before, results))
     found = [Change(*key, mean(then[key]), mean(now[key])) for key in now if key in then]
     return sorted(found, key=lambda change: change.now - change.before)
+
+
+def _psnr_of_rows(results: Results) -> dict[tuple[str, str], list[float]]:
+    """PSNR of each sequence and row, one for each seed."""
+    return {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
+
+
+def _of_sequences(results: Results, sequences: set[str]) -> Results:
+    """The results on some of the sequences."""
+    return {**results, "runs": [run for run in results["runs"] if run["sequence"] in sequences]}
 
 
 def changes_table(changes: list[Change], file: str) -> Table:

@@ -219,6 +219,20 @@ def test_what_a_score_should_be_stands_in_brackets_where_it_is_known():
     assert [line[2] for line in found] == ["0.750 (0.800)", "0.500"]
 
 
+def test_a_mean_over_a_part_of_the_sequences_is_named_by_them_and_compared_with_the_same_ones():
+    whole = {"mean": True, "sequences": ["a", "b"], "published": {"mean": {"events": {"psnr": 30.0}}}}
+    both = results(run("events", 25.0, "a"), run("events", 21.0, "b"), **whole)
+    part = results(run("events", 21.0, "b"), **whole)
+    assert [line[:3] for line in rows_of(markdown(both))] == [["mean", "events", "23.00"]]
+    assert rows_of(markdown(both))[0][-1] == "30.00"
+    assert [line[:3] for line in rows_of(markdown(part))] == [["mean of b", "events", "21.00"]]
+    assert "30.00" not in markdown(part)
+    for old in (both, {name: value for name, value in both.items() if name != "sequences"}):
+        assert [(change.row, change.before, change.now) for change in changes_since(part, old)] == [
+            ("events", 21.0, 21.0)
+        ]
+
+
 def test_what_became_of_each_row_since_another_version_stands_worst_first():
     before = results(run("events", 25.0), run("events", 27.0, seed=1), run("frames", 20.0), run("gone", 20.0))
     now = results(run("events", 25.65), run("events", 25.65, seed=1), run("frames", 25.0), run("new", 9.0))

@@ -10,7 +10,17 @@ from pathlib import Path
 import pytest
 
 from enerf_ns.bench import inputs
-from enerf_ns.bench.inputs import LEFT_OUT, ROOTS, modules, recording_digest
+from enerf_ns.bench.experiments import SEQUENCES
+from enerf_ns.bench.inputs import (
+    ALL_READERS,
+    LEFT_OUT,
+    NUMERICAL_ERRORS,
+    SIMULATION,
+    TRAINING,
+    modules,
+    recording_digest,
+)
+from enerf_ns.simulator.settings import resolve
 
 IN_A_TRAINING = """
 import sys
@@ -39,17 +49,29 @@ def test_all_that_a_training_imports_counts(tmp_path: Path):
     imported = {name for name in ran.stdout.splitlines()[-1].split() if not name.startswith((*LEFT_OUT, OTHER_FORMATS))}
     assert len(imported) > 100
     not_of_it = {"enerf_ns.bench", "enerf_ns.flags"}
-    missing = {name for name in imported - modules(ROOTS) if not name.startswith(tuple(not_of_it))}
+    missing = {name for name in imported - modules(TRAINING) if not name.startswith(tuple(not_of_it))}
     packages = {name for name in missing if any(other.startswith(f"{name}.") for other in imported)}
     assert missing - packages == set()
 
 
 def test_reports_and_readers_of_other_formats_do_not_count():
-    found = modules(ROOTS)
+    found = modules(TRAINING)
     for name in ("report.page", "method.viewer.scene_view", "dataparsers.formats.eds", "scripts.cli", "bench.runner"):
         assert f"enerf_ns.{name}" not in found
     for name in ("method.model", "supervision.losses", "dataparsers.index.event_index", "kernels.hash_grid_triton"):
         assert f"enerf_ns.{name}" in found
+
+
+def test_what_a_row_needs_beyond_that_counts_where_it_is_asked_for():
+    assert "enerf_ns.dataparsers.formats.davis" in modules([*TRAINING, ALL_READERS])
+    assert NUMERICAL_ERRORS in modules([*TRAINING, NUMERICAL_ERRORS]) and NUMERICAL_ERRORS not in modules(TRAINING)
+
+
+def test_the_layouts_of_all_simulated_recordings_count(tmp_path: Path):
+    simulated = [sequence for sequence in SEQUENCES.values() if sequence.scene is not None]
+    layouts = {resolve(sequence.simulation_settings(tmp_path)).layout for sequence in simulated}
+    assert len(layouts) > 1
+    assert {f"enerf_ns.dataparsers.formats.{layout}" for layout in layouts} <= modules(SIMULATION)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +89,7 @@ def test_words_do_not_count_and_code_does(changed: str, counts: bool, monkeypatc
     def digest(text: str) -> str:
         module = "enerf_ns.sensor.response"
         monkeypatch.setattr(inputs, "_parsed", lambda name: ast.parse(text) if name == module else parsed(name))
-        return inputs.code_digest.__wrapped__()
+        return inputs.code_digest.__wrapped__(*TRAINING)
 
     assert (digest(changed) != digest('def f(x):\n    """Words."""\n    return 2 * x\n')) == counts
 

@@ -86,8 +86,18 @@ def test_a_result_file_alone_is_enough_to_go_on(finished: Path, tmp_path: Path):
 
 def test_a_result_of_other_code_is_made_again(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = shutil.copytree(finished, tmp_path / "copy")
-    monkeypatch.setattr(runner, "code_digest", lambda: "other code")
+    monkeypatch.setattr(runner, "code_digest", lambda *_: "other code")
     assert len(finish(folder)) == len(table(folder))
+    assert len(list((folder / "recordings").iterdir())) == 2, "the simulator is other code, too"
+
+
+def test_a_training_that_failed_here_hides_no_result_of_another_machine(finished: Path, tmp_path: Path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    before = table(folder)
+    for file in folder.glob("runs/*/*/*/result.json"):
+        file.write_text(json.dumps({**json.loads(file.read_text()), "failure": "No space left."}))
+    assert finish(folder) == []
+    assert table(folder) == before
 
 
 @pytest.mark.parametrize(("better", "fails"), [(-1.0, False), (0.0, False), (1.0, True)])
@@ -121,6 +131,9 @@ def test_results_of_other_conditions_are_not_compared(finished: Path, tmp_path: 
     (tmp_path / "before.json").write_text(json.dumps({**before, what: value}))
     with pytest.raises(FlagError, match=r"design\.json is the file that this bench writes; give another --output-dir"):
         Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": finished, "against": finished / "design.json"}))
+    if what == "scale":  # recordings of the user have none
+        (tmp_path / "recorded.json").write_text(json.dumps({**before, "scale": None}))
+        Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": tmp_path / "recorded.json"}))
     with pytest.raises(FlagError, match=f"results of {what} {value}, but this bench has {what} {before[what]}; give a"):
         Bench("design", BenchSettings(**{**SMALL_BENCH, "output_dir": tmp_path, "against": tmp_path / "before.json"}))
 
