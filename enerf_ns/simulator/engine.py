@@ -123,13 +123,17 @@ def _exposures(settings: SimulationSettings, view: View) -> Exposures:
         longest = max(0, length // count // 2000 - 1) * 2e-3
         exposure_ms = min(preset.exposure_ms, longest)
     exposure = round(exposure_ms * 500) * 2000
-    if count * 1000 > length or (count == 1 and exposure > length):
-        raise FlagError(
-            f"{length * 1e-9:g} s have no room for {count} frame{'s' * (count > 1)} with exposures of "
-            f"{exposure * 1e-6:g} ms, since frames are at least 1 us apart; give less or a longer --duration."
-        )
+    no_room = FlagError(
+        f"{length * 1e-9:g} s have no room for {count} frame{'s' * (count > 1)} with exposures of "
+        f"{exposure * 1e-6:g} ms, since frames are at least 1 us apart; give less or a longer --duration."
+    )
+    if count * 1000 > length:
+        raise no_room
     times = view.start + ((np.arange(count) + 0.5) * length / count).astype(np.int64) // 1000 * 1000
-    return Exposures(times, exposure)
+    exposures = Exposures(times, exposure)
+    if exposures.opens[0] < view.start or exposures.closes[-1] > view.end:
+        raise no_room
+    return exposures
 
 
 class _EventCamera:

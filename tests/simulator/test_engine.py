@@ -184,6 +184,8 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
         (RecordingError, dict(key_frames=Path("nowhere.txt")), "nowhere.txt is missing"),
         (FlagError, dict(width=30000, height=30000), "30000 x 30000 pixels is too large"),
         (FlagError, dict(num_frames=10**9, exposure_ms=0.0), "0.3 s have no room for 1000000000 frames"),
+        (FlagError, dict(duration=0.0999998, num_frames=2, exposure_ms=50.0), "s have no room for 2 frames with exp"),
+        (FlagError, dict(duration=0.05, num_frames=1, exposure_ms=60.0), "have no room for 1 frame with exposures of"),
         (FlagError, dict(duration=1e-4), "--duration is 0.0001, but must be"),
         (FlagError, dict(layout="eds"), "--width changes nothing in the layout eds without --cameras"),
         (FlagError, dict(cameras=Path("nowhere.json")), "--width changes nothing beside --cameras"),

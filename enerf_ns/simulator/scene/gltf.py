@@ -1,8 +1,9 @@
 """Checks glTF files before trimesh reads them: whether all that they name is there, and what trimesh would misread.
 
-trimesh 5.2 takes the integers of quantised and sparse arrays for coordinates, ignores required extensions, and leaves
-out pictures that it cannot decode. It copies each view and each accessor, follows nodes that have several parents, and
-its errors at a damaged file name neither the part of the file nor the fault.
+trimesh 5.2 takes the integers of quantised and sparse arrays for coordinates, keeps the low 8 bits of colours of 16
+bits without a material, ignores required extensions, and leaves out pictures that it cannot decode. It copies each view
+and each accessor, follows nodes that have several parents, and its errors at a damaged file name neither the part of
+the file nor the fault.
 
 The specification of glTF 2.0: registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 """
@@ -31,10 +32,13 @@ MOST_TRIANGLES = 2_000_000
 DEEPEST_NODE = 256
 """Most nodes above one another. trimesh follows all of them for each mesh."""
 
-FLOAT, TRIANGLES, FAN = 5126, 4, 6
-"""Component type of floating point numbers, and modes of triangles and of a fan of triangles."""
+UNSIGNED_SHORT, FLOAT = 5123, 5126
+"""Component types of whole numbers of 16 bits and of floating point numbers."""
 
-COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, FLOAT: 4}
+TRIANGLES, FAN = 4, 6
+"""Modes of triangles and of a fan of triangles."""
+
+COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, UNSIGNED_SHORT: 2, 5125: 4, FLOAT: 4}
 PARTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 DRACO = "KHR_draco_mesh_compression"
@@ -163,6 +167,12 @@ def _triangles(header: Value, primitive: Value) -> int:
         raise RecordingError(
             f"{header.path} holds positions or texture coordinates that are sparse or not floating point, which cannot "
             "be read; export it without quantization."
+        )
+    colours = accessors.get("COLOR_0")
+    if colours is not None and colours.found["componentType"] == UNSIGNED_SHORT and primitive.get("material") is None:
+        raise RecordingError(
+            f"{header.path} holds colours of vertices in 16 bits without a material, which cannot be read; give the "
+            "mesh a material, or its colours 8 bits."
         )
     mode = primitive.found.get("mode", TRIANGLES)
     indices = primitive.get("indices")

@@ -258,6 +258,25 @@ def test_colours_of_gltf_are_linear_and_multiplied(tmp_path):
     assert not notes
 
 
+def test_colours_of_16_bits_are_read_with_a_material_and_refused_without(tmp_path):
+    levels = np.array([[0.5, 0.25, 0.5], [0.003, 0.002, 0.003], [1, 1, 1]])
+    about = gltf(np.column_stack([QUAD[:3], np.zeros(3)]), [[0, 2, 1]], COLOR_0=levels)
+    numbers = np.pad(np.round(65535 * levels), ((0, 0), (0, 3))).astype("<u2").tobytes()  # 12 bytes, as three floats
+    blob = bytearray(base64.b64decode(about["buffers"][0]["uri"].partition("base64,")[2]))
+    blob[36:72] = numbers
+    about["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    about["accessors"][1] |= {"componentType": 5123, "normalized": True}
+    about["bufferViews"][1]["byteStride"] = 12
+    (tmp_path / "a.gltf").write_text(json.dumps(about))
+    with pytest.raises(RecordingError, match="colours of vertices in 16 bits without a material"):
+        load(tmp_path / "a.gltf")
+    about["meshes"][0]["primitives"][0]["material"] = 0
+    about["materials"] = [{"pbrMetallicRoughness": {}}]
+    (tmp_path / "a.gltf").write_text(json.dumps(about))
+    scene, _ = load(tmp_path / "a.gltf")
+    np.testing.assert_allclose(lightless(scene), levels[[0, 2, 1]], atol=1e-4)
+
+
 def test_a_mesh_without_anything_is_grey_and_a_note_says_so(tmp_path):
     (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 2 0\n1 2 0\n0 2 1\n3 0 1 2\n")
     scene, (note,) = load(tmp_path / "a.off")
