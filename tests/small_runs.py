@@ -42,7 +42,9 @@ def small_config(data: Path, output_dir: Path, method=enerf, **changes: Any) -> 
 
 
 def set_up(config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1) -> Any:
-    """A trainer as `ns-train` makes it, set up."""
+    """A trainer as `ns-train` makes it, set up, in place of a run that no checkpoint was stored of."""
+    for file in config.output_dir.glob(f"*/{config.method_name}/{config.timestamp}/config.yml"):
+        file.unlink()
     _set_random_seed(config.machine.seed)
     config.save_config()
     trainer = config.setup(local_rank=local_rank, world_size=world_size)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
+import shutil
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from nerfstudio.scripts.train import main
 from nerfstudio.utils import writer
 from small_runs import set_up, small_config
 
+from enerf_ns.method import trainer as trainer_module
 from enerf_ns.method.error_against_time import ErrorAgainstTime
 from enerf_ns.method.trainer import EnerfTrainerConfig
 
@@ -218,6 +222,48 @@ def test_a_run_that_is_there_is_not_written_over(recording: Path, tmp_path: Path
     assert {file: file.read_bytes() for file in first.base_dir.rglob("*") if file.is_file()} == before
 
 
+def test_a_run_that_has_no_checkpoint_yet_is_not_written_over_but_starts_again(
+    recording: Path, tmp_path: Path, monkeypatch
+):
+    """As of two commands that start in the same second. What starts it again leaves the origin as it was."""
+    monkeypatch.setattr(sys, "argv", ["ns-train", "enerf", "--machine.seed", "7"])
+    small_config(recording, tmp_path).save_config()
+    folder = tmp_path / "recording/enerf/run"
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    with pytest.raises(SystemExit, match=r"run holds a run already; continue it with --load-config .*config\.yml,"):
+        small_config(recording, tmp_path, data__event_pairs=32).save_config()
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before
+    monkeypatch.setattr(sys, "argv", ["ns-train", "enerf", "--load-config", "config.yml"])
+    loaded = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    loaded.save_config()
+    assert json.loads((folder / "origin.json").read_text())["command"] == "ns-train enerf --machine.seed 7"
+
+
+def test_processes_of_a_run_that_goes_on_draw_batches_of_their_own(recording: Path, tmp_path: Path, monkeypatch):
+    """The first one those that it would have drawn; the others neither these nor those of the start again."""
+    config = small_config(recording, tmp_path)
+    config.max_num_iterations, config.machine.seed = 5, 3
+    stopped = trained(config, stop_after=1)
+    drawn = []
+
+    def draw(trainer: Any) -> None:
+        drawn.append(trainer.pipeline.datamanager.next_batch(trainer.pipeline.model.sensor).events.pixels)
+        drawn.append(torch.randint(2**40, (8,)))
+
+    draw(stopped)
+    for rank in range(3):
+        monkeypatch.setattr(trainer_module, "get_rank", lambda rank=rank: rank)
+        monkeypatch.setattr(trainer_module, "is_main_process", lambda rank=rank: rank == 0)
+        loaded = stored(stopped)
+        loaded.machine.seed += rank
+        draw(set_up(loaded))
+        new = small_config(recording, tmp_path / f"new-{rank}")
+        new.machine.seed = config.machine.seed + rank
+        draw(set_up(new))
+    assert all(torch.equal(*pair) for pair in zip(drawn[:2], drawn[2:4], strict=True))
+    assert len({tuple(numbers.tolist()) for numbers in drawn[2:]}) == len(drawn[2:])
+
+
 def test_what_is_left_is_told_of_the_run_as_a_whole(recording: Path, tmp_path: Path):
     config = small_config(recording, tmp_path)
     config.max_num_iterations = 20
@@ -305,6 +351,23 @@ def test_a_config_that_is_none_is_one_sentence_as_soon_as_the_flag_is_read(tmp_p
         file.write_bytes(content)
     with pytest.raises(SystemExit, match=rf"^enerf: {file} [^\n]*\.$"):
         EnerfTrainerConfig(method_name="enerf", load_config=file)
+
+
+def test_a_run_that_was_moved_is_one_sentence_with_the_command_that_trains_on(first: Any, tmp_path: Path, monkeypatch):
+    """Not trained from its start where it was before. A config.yml alone, or a link to the run, continues the run."""
+    folder = tmp_path / "new place"
+    shutil.copytree(first.base_dir, folder)
+    with pytest.raises(SystemExit, match=rf"^enerf: [^\n]*{first.base_dir}, [^\n]* {folder};[^\n]*\.$") as refused:
+        EnerfTrainerConfig(method_name="enerf", load_config=folder / "config.yml")
+    assert str(refused.value).endswith(f" --load-dir '{folder / 'nerfstudio_models'}'.")
+    shutil.rmtree(folder / "nerfstudio_models")
+    (tmp_path / "link").symlink_to(first.base_dir)
+    monkeypatch.setenv("HOME", str(folder))
+    for given, file in (
+        (tmp_path / "link/config.yml", first.base_dir / "config.yml"),
+        (Path("~/config.yml"), folder / "config.yml"),
+    ):
+        assert EnerfTrainerConfig(method_name="enerf", load_config=given).load_config == file
 
 
 @pytest.mark.parametrize(("of", "name"), [(Trainer, "setup"), (ErrorAgainstTime, "finish")])

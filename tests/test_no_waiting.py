@@ -41,6 +41,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "data__pair_mode": "accumulated",
         "data__silent_pairs": 32,
         "data__silent_mode": "intervals",
+        "sensor__cutoff_frequency": 100.0,
     },
     "events and frames over their exposure": {"data__supervision": "events+frames", "data__exposure_samples": 3},
     "frames, with view direction": {"data__supervision": "frames", "model__view_direction": True},
@@ -104,13 +105,14 @@ def test_a_step_reads_nothing_from_the_gpu(recording: Path, tmp_path: Path, name
 
 
 def test_the_backward_pass_and_the_optimiser_read_nothing(recording: Path, tmp_path: Path) -> None:
-    trainer = set_up(small_config(recording, tmp_path, data__silent_pairs=32, data__supervision="events+frames"))
+    changes = {"data__silent_pairs": 32, "data__supervision": "events+frames", "sensor__learn_leak_rate": True}
+    trainer = set_up(small_config(recording, tmp_path, **changes))
     trainer.train_iteration(0)
     trainer.optimizers.zero_grad_all()
     _, losses, _ = trainer.pipeline.get_train_loss_dict(1)
     with NothingIsRead():
         torch.stack([*losses.values()]).sum().backward()
-        trainer.optimizers.optimizer_scaler_step_some(trainer.grad_scaler, ["fields"])
+        trainer.optimizers.optimizer_scaler_step_some(trainer.grad_scaler, ["fields", "leak_rate"])
     assert trainer.optimizers.finite
 
 
@@ -124,7 +126,8 @@ def test_what_refuses_to_be_read_notices() -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_step_on_a_gpu_waits_for_nothing(recording: Path, tmp_path: Path) -> None:
-    config = small_config(recording, tmp_path, data__silent_pairs=32, data__supervision="events+frames")
+    changes = {"data__silent_pairs": 32, "data__supervision": "events+frames", "sensor__learn_leak_rate": True}
+    config = small_config(recording, tmp_path, **changes)
     config.machine.device_type = "cuda"
     trainer = set_up(config)
     trainer.train_iteration(0)

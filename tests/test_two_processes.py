@@ -18,8 +18,14 @@ STEPS = 4
 
 def two_process_config(recording: Path, folder: Path) -> Any:
     config = small_config(
-        recording, folder, data__supervision="events+frames", data__silent_pairs=32, model__frame_loss_weight=10.0
-    )  # a weight by errors would be that of both batches
+        recording,
+        folder,
+        data__supervision="events+frames",
+        data__silent_pairs=32,
+        model__frame_loss_weight=10.0,  # a weight by errors would be that of both batches
+        model__learn_exposure=True,
+        sensor__learn_leak_rate=True,
+    )
     config.max_num_iterations = STEPS
     return config
 
@@ -81,7 +87,7 @@ def test_two_processes_train_as_one_would_with_both_batches(recording: Path, bot
             if mine.grad is not None:
                 assert theirs.grad is not None
                 mine.grad.add_(theirs.grad).mul_(0.5)
-        first.optimizers.optimizer_scaler_step_some(first.grad_scaler, ["fields"])
+        first.optimizers.optimizer_scaler_step_some(first.grad_scaler, ["fields", "leak_rate"])
         first.optimizers.scheduler_step_all(step)
         field = first.pipeline.model.state_dict()
         second.pipeline.model.load_state_dict(field)

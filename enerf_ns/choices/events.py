@@ -54,12 +54,26 @@ def held_out_events(scene: Scene) -> None:
 
 
 def missed_changes(scene: Scene) -> None:
-    """Is what pixels missed while they were blind added to the sums of their events?"""
+    """Is what pixels missed while they were blind added to the sums of their events?
+
+    Raises:
+        FlagError: It is to be added for another time than that for which pixels are known to be blind.
+    """
     name, blind = "datamanager.completed_refractory_ns", scene.once(blind_for)
-    noise = scene.once(_noise_of_completed)
-    kept = bool(scene.use(name, lambda: blind if noise < MOST_NOISE_COMPLETED else 0))
+    noise, is_learned = scene.once(_noise_of_completed), scene.config.model.sensor.learn_refractory_period
+    known = 0 if is_learned else blind
+    completed = scene.use(name, lambda: known if noise < MOST_NOISE_COMPLETED else 0)
+    if completed not in (0, known):
+        expected = f"0, or the refractory period of {known}," if known else "0"
+        raise FlagError(
+            f"--pipeline.datamanager.completed-refractory-ns is {completed}, but {expected} was expected, since sums "
+            "are completed for a period that is known and not learned; leave it out."
+        )
+    kept = bool(completed)
     if not blind:
         why = "pixels are not known to be blind after an event"
+    elif is_learned:
+        why = "the refractory period is learned, and completed sums would keep the one that it starts from"
     elif not (scene.use_events and scene.defaults.instants):
         why = "the method does not use them" if scene.use_events else "the field does not learn from events"
     elif math.isinf(noise):

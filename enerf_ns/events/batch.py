@@ -31,8 +31,8 @@ class EventBatch:
     starts_at_events: bool = True
     """Whether pairs of events begin at events, after which pixels may be blind. Windows of time do not."""
     rates: Float[Tensor, "pairs 2 2"] | None = None
-    """Events per second around the first and the second instant of each pair, on and off: `samplers.rates_around` of
-    events, `samplers.rates_between` of any instants, and 0 of silent pairs, both instants of which lie between the same
+    """Events per second around the first and the second instant of each pair, on and off: `rates_around` of events,
+    `rates_between` of windows and of any instants, and 0 of silent pairs, both instants of which lie between the same
     events. None if the sensor model needs no rates."""
     ahead: Float[Tensor, " pairs"] | None = None
     """Expected change of log brightness beyond the sum of the events, in thresholds, for instants that are no events.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
 from enerf_ns.dataparsers.index.event_index import EventIndex
@@ -238,6 +238,14 @@ def _sums(
     return on + (after - before)[:, 0], off + (after - before)[:, 1]
 
 
+def _rates_at(
+    index: EventIndex, until: Sequence[Tensor], pixels: Tensor, times: Sequence[Tensor], blind_ns: int
+) -> Float32[Tensor, "pairs 2 2"]:
+    """Rates of events at two instants of each pair, as `EventBatch.rates`. Arguments as in `_sums`."""
+    instants = zip(until, times, strict=True)
+    return torch.stack([rates_between(index, number, pixels, time, blind_ns) for number, time in instants], dim=1)
+
+
 def _batch_of_chains(
     pairs_of: Callable[[Tensor, Tensor, Tensor], EventBatch],
     pixels: Int64[Tensor, " chains_and_others"],
@@ -282,14 +290,14 @@ class HeldOutPairSampler:
         missed: MissedChanges | None = None,
     ):
         self.index, self.missed = index, missed
-        held_out = _places(_last_of_each(index, None, spans)).long()
-        pixels = torch.searchsorted(index.offsets, held_out, right=True) - 1
+        held_out = _places(_last_of_each(index, None, spans))
+        pixels = torch.searchsorted(index.offsets.int(), held_out, right=True, out_int32=True) - 1
         pairs = [held_out.new_zeros((0, 3))]
         for distance in range(1, min(max_distance + 1, len(held_out))):
             start, end, pixel = held_out[:-distance], held_out[distance:], pixels[distance:]
             chosen = (pixels[:-distance] == pixel) & (end - start <= max_distance)
             pairs.append(torch.stack([pixel, start, end], dim=-1)[chosen])
-        self._pairs = torch.cat(pairs).int()
+        self._pairs = torch.cat(pairs)
         if not len(self._pairs):
             raise ValueError(f"no pixel fired twice, {max_distance} events apart or less, in the time that is held out")
 
@@ -525,15 +533,11 @@ class InstantPairSampler:
         until = first, last
         going = [torch.where(number > begin, 2 * self._is_on(number) - 1, 0) for number in until]
         ahead = torch.where(until[1] > until[0], AHEAD * (going[1] - going[0]), 0.0)
-        rates = None
-        if blind_ns is not None:
-            instants = zip(until, (start, end), strict=True)
-            rates = torch.stack([rates_between(self.index, n, pixels, time, blind_ns) for n, time in instants], dim=1)
         return EventBatch(
             *(pixels, start, end, *_sums(self.index, self.missed, pixels, until, (start, end))),
             num_any=len(pixels),
             starts_at_events=False,
-            rates=rates,
+            rates=None if blind_ns is None else _rates_at(self.index, until, pixels, (start, end), blind_ns),
             ahead=ahead,
         )
 
@@ -592,7 +596,7 @@ class AccumulationSampler:
         Args:
             batch_size: Number of pairs.
             generator: On the device of the index.
-            blind_ns: Has no effect, since the ends of windows are no events and have no rates.
+            blind_ns: As in `EventPairSampler.sample`; the rates are those of `rates_between`.
         """
         negatives = round(self.NEGATIVE_SHARE * batch_size)
 
@@ -610,7 +614,11 @@ class AccumulationSampler:
         )
         columns = zip(*(batch.columns for batch in found), strict=True)
         pixels, start, end, on, off = (torch.cat(both) for both in columns)
-        return EventBatch(pixels, start, end, on, off, starts_at_events=False)
+        rates = None
+        if blind_ns is not None:
+            until = [self.index.offsets[pixels] + self.index.count_until(pixels, time) for time in (start, end)]
+            rates = _rates_at(self.index, until, pixels, (start, end), blind_ns)
+        return EventBatch(pixels, start, end, on, off, starts_at_events=False, rates=rates)
 
     def _windows(self, draws: int, generator: torch.Generator) -> EventBatch:
         """Windows of any length, 0 included, at random pixels."""

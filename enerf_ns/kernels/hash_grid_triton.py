@@ -145,9 +145,10 @@ class _HashGrid(torch.autograd.Function):
         (num_positions, _), (num_rows, features), num_levels = x.shape, table.shape, len(scalings)
         encoding = x.new_empty(num_levels * features, num_positions)
         if num_positions:
-            _forward[triton.cdiv(num_positions, BLOCK), num_levels](
-                x, table, scalings, encoding, num_positions, num_rows // num_levels, num_positions, features, BLOCK
-            )
+            with torch.cuda.device_of(x):  # as autograd does for the backward pass
+                _forward[triton.cdiv(num_positions, BLOCK), num_levels](
+                    x, table, scalings, encoding, num_positions, num_rows // num_levels, num_positions, features, BLOCK
+                )
         return encoding.t()
 
     @staticmethod

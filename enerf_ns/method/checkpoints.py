@@ -70,6 +70,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
     for path in sorted(folder.glob("step-" + "[0-9]" * 9 + ".ckpt"), reverse=True):
         if is_whole(path):
             return path
+        if not os.path.lexists(path):
+            return newest_checkpoint(folder)  # training stored another one, and removed this one
         _say_passed_over(path)
     raise RecordingError(
         f"{folder} holds no whole checkpoint; give another run, or remove this folder to train its run from the start."
@@ -123,6 +125,13 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def set_random_seed(seed: int) -> None:
+    """Seeds the global random generators of the process, with a seed from 0 to 2^32 - 1."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - libraries draw from it
+    torch.manual_seed(seed)
 
 
 def random_state(device: torch.device) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def method_config(
             },
             **{
                 name: {
-                    "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
+                    "optimizer": FusedAdamOptimizerConfig(lr=rate, eps=1e-15, betas=(0.9, 0.999)),
                     "scheduler": DecayOverRunSchedulerConfig(lr_final=0.1 * rate),
                 }
                 for name, rate in SensorModel.learning_rates().items()

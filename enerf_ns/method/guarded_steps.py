@@ -14,7 +14,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Module, Parameter
 
 from enerf_ns.dataparsers.recording.files import write_whole
-from enerf_ns.method.nerfstudio_seams import leave_out_fused_step
+from enerf_ns.method.nerfstudio_seams import average_left_out, leave_out_fused_step
 from enerf_ns.method.pipeline import TrainStep
 from enerf_ns.sensor.sensor_model import SensorModel
 from enerf_ns.supervision.event_supervision import brightness_change
@@ -35,6 +35,8 @@ nothing."""
 class GuardedOptimizers(Optimizers):
     """Nerfstudio's optimisers, which leave out a step that is not finite. On a GPU they do not wait for that result.
 
+    Gradients that DistributedDataParallel leaves out are averaged over all processes before.
+
     Args:
         config: Optimisers and schedulers by the name of the group of parameters.
         param_groups: Parameters by the name of the group.
@@ -50,6 +52,8 @@ class GuardedOptimizers(Optimizers):
         """Whether the last step was finite, a boolean on the device; None before the first step."""
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        for group in param_groups:
+            average_left_out(self.parameters[group])
         self.finite = self.is_finite()
         taken = []
         for group in param_groups:
@@ -58,7 +62,7 @@ class GuardedOptimizers(Optimizers):
             if grad_scaler.is_enabled():  # GradScaler leaves out a step by itself if it finds a NaN
                 for gradient in sorted(gradients, key=Tensor.numel)[:1]:
                     gradient.masked_fill_(~self.finite, torch.nan)
-            elif optimizer.defaults.get("fused"):
+            elif all(settings.get("fused") for settings in optimizer.param_groups):  # as a checkpoint may state
                 leave_out_fused_step(optimizer, ~self.finite)
             elif not self.finite:
                 continue

@@ -161,7 +161,7 @@ class EnerfModelConfig(ModelConfig):
     """Weight of the interlevel loss of mip-NeRF 360, from which the proposal network learns."""
     edge_start: Optional[bool] = None  # noqa: UP045
     """Start from the depth of edges that events show before training. Default: True with events alone, where more than
-    5 % of the pixels have such an edge and no changes are missed that are not known; for enerf-paper, False."""
+    5 % of the pixels have such an edge and sums of events are complete; for enerf-paper, False."""
     init_density: float = 1.0
     """Density before training, in 1 / scene unit. A field that starts transparent first learns a negative of the scene:
     holes in fog before a bright background."""
@@ -404,15 +404,15 @@ class EnerfModel(Model):
         """Outputs of the rays of a picture, each of shape (height, width, channels). Normals and confidence are
         computed when they are read. Confidence is 0 at rims (`is_rim`)."""
         outputs = Outputs(super().get_outputs_for_camera_ray_bundle(camera_ray_bundle))
+        depth = outputs["depth"].clone()  # ns-render scales raw-depth in place
 
         def normals() -> Tensor:
-            points = camera_ray_bundle.origins + camera_ray_bundle.directions * outputs["depth"]
+            points = camera_ray_bundle.origins + camera_ray_bundle.directions * depth
             chunks = points.reshape(-1, 3).split(self.config.eval_num_rays_per_chunk)
             found = [self.normals(chunk.to(self.device)).to(points.device) for chunk in chunks]
             return torch.cat(found).view(points.shape)
 
         outputs["normals"] = normals
-        depth = outputs["depth"]
         outputs["confidence"] = lambda: self.depth_evidence(camera_ray_bundle, depth)[0] * ~is_rim(depth)
         return outputs
 

@@ -7,7 +7,7 @@ names each place that has moved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,9 @@ import torch
 from nerfstudio.model_components.ray_samplers import Sampler
 from nerfstudio.utils import writer
 from torch import Tensor
+from torch.distributed import all_reduce, get_world_size
+from torch.nn import Module, Parameter
+from torch.nn.parallel import DistributedDataParallel
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.control_panel import ControlPanel
@@ -142,6 +145,11 @@ SEAMS = (
     Seam("nerfstudio.field_components.mlp:MLP.layers", "kernels.network and network_numba read the weights"),
     Seam("nerfstudio.utils.rich_utils:CONSOLE", "terminal.without_chatter replaces print and log within a block"),
     *(Seam(f"torch.optim.adam:Adam.{name}", "leave_out_fused_step") for name in ("found_inf", "grad_scale")),
+    Seam(
+        "torch.nn.parallel:DistributedDataParallel._set_params_and_buffers_to_ignore_for_model",
+        "leave_out_of_parallel; average_left_out reads _ddp_ignored, which it sets",
+        ("module", "params_and_buffers_to_ignore"),
+    ),
     # without which flags.speak_for_methods leaves help and errors to tyro
     Seam(
         f"{_HELP}:format_help",
@@ -205,6 +213,28 @@ def leave_out_fused_step(optimizer: torch.optim.Optimizer, left_out: Tensor) -> 
     """
     optimizer.found_inf = left_out.float()  # type: ignore[attr-defined]
     optimizer.grad_scale = None  # type: ignore[attr-defined]
+
+
+def leave_out_of_parallel(model: Module, modules: tuple[str, ...]) -> None:
+    """Makes DistributedDataParallel leave out the parameters of some modules of a model, which it is then to wrap.
+
+    Parameters that are used outside the forward pass of the model make it fail. torch 2.11 has no public way to leave
+    them out. `average_left_out` averages their gradients in its place.
+
+    Args:
+        model: The model; every process starts with equal parameters in these modules.
+        modules: Names of attributes of the model.
+    """
+    left_out = [name for name, _ in model.named_parameters() if name.partition(".")[0] in modules]
+    DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(model, left_out)
+
+
+def average_left_out(parameters: Iterable[Parameter]) -> None:
+    """Averages, over all processes, the gradients of those parameters that `leave_out_of_parallel` left out."""
+    for parameter in parameters:
+        if parameter.grad is not None and getattr(parameter, "_ddp_ignored", False):
+            all_reduce(parameter.grad)
+            parameter.grad /= get_world_size()
 
 
 def tidy_control_panel(panel: ControlPanel, max_width: int) -> None:

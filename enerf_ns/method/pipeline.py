@@ -35,6 +35,7 @@ from enerf_ns.method.datamanager import EnerfDataManager, EnerfDataManagerConfig
 from enerf_ns.method.held_out_views import held_out_view, held_out_views, scores_at_stated_poses
 from enerf_ns.method.memory import SMALL_STEP, free_bytes, step_cost
 from enerf_ns.method.model import EnerfModel, EnerfModelConfig, fog_growth
+from enerf_ns.method.nerfstudio_seams import leave_out_of_parallel
 from enerf_ns.method.stopwatch import Stopwatch
 from enerf_ns.method.viewer.guard import guard_viser
 from enerf_ns.poses.refiner import (
@@ -80,6 +81,11 @@ SLOPE_NS = 1_000_000
 TAKEN_BACK = (
     "The last corrections of clock, poses and lens are taken back, and no further ones are made, because events fit "
     "them worse than those before; check --depth-range, and poses and calibration with enerf inspect."
+)
+
+NOT_REFINED = (
+    "Clock, mount, lens and drift of the poses stay as they are before training, because several devices train the "
+    "field; training on one device refines them."
 )
 
 
@@ -158,16 +164,17 @@ class EnerfPipeline(VanillaPipeline):
         self._fit_memory(trains)
         if trains:
             self._start_threshold_map()
+        self.poses = PoseRefiner(config.poses, self.datamanager.recording)
+        self._correct_poses()
         if self.model.exposure is not None:
             self.model.exposure.times.copy_(torch.from_numpy(self.datamanager.train_dataset.frames.times))
-        self.poses: PoseRefiner | None = None
-        if "events" in config.datamanager.supervision and world_size == 1:
-            self.poses = PoseRefiner(config.poses, self.datamanager.recording)
-            self._correct_poses()
+        if world_size > 1 and local_rank == 0 and trains and self.poses.allowed:
+            say(NOT_REFINED)
         self._viewer: SceneView | None = None
         self.model.seen_volume, self.model.display = self.seen_volume, self.shown
         self.world_size = world_size
         if world_size > 1:  # here, since Nerfstudio takes every device for a GPU
+            leave_out_of_parallel(self.model, ("sensor", "exposure"))  # which losses use
             gpus = [local_rank] if torch.device(device).type == "cuda" else None
             parallel = DistributedDataParallel(self._model, device_ids=gpus, find_unused_parameters=True)
             self._model = cast("Model", parallel)
@@ -280,7 +287,7 @@ class EnerfPipeline(VanillaPipeline):
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)
         detached = {name: loss.detach() for name, loss in losses.items()}
-        if self.training and self.poses is not None and batch.events is not None:
+        if self.training and self.world_size == 1 and batch.events is not None:
             self._refine_poses(self.poses, batch.events, step)
         self.last_step = TrainStep(batch, outputs["rgb"].detach(), outputs["accumulation"].detach(), detached)
         self.stopwatch.lap("losses")
@@ -359,14 +366,12 @@ class EnerfPipeline(VanillaPipeline):
 
     def _correct_poses(self) -> None:
         """Applies the current corrections of the poses to the rays and to the held-out frames."""
-        if self.poses is not None:
-            self.datamanager.correct(self.poses.corrections)
+        self.datamanager.correct(self.poses.corrections)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         super().load_pipeline(loaded_state, step)
         self._correct_poses()
-        if self.poses is not None:
-            self.config.datamanager.corrections = self.poses.corrections
+        self.config.datamanager.corrections = self.poses.corrections
 
     @torch.no_grad()
     def _slopes(self, batch: EventBatch, number: int) -> Float[Tensor, "pairs 2"]:
@@ -451,7 +456,7 @@ class EnerfPipeline(VanillaPipeline):
                 save_pictures(aligned_views(views)[0], output_path)
         scores = summary_scores(views, summary, get_std)
         protocol = str(scores["protocol"] if step is None else scores.pop("protocol"))
-        if step is None and self.poses is not None and self.poses.corrected:
+        if step is None and self.poses.corrected:
             stated = scores_at_stated_poses(self)
             scores |= {f"{name}_at_stated_poses": value for name, value in stated.items()}
         CONSOLE.print(described(protocol), soft_wrap=True, highlight=False, markup=False)

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import copy
-import random
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, cast
-
-import numpy as np
-import torch
 
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import absolute
@@ -97,11 +93,10 @@ def set_up(config: EnerfTrainerConfig) -> EnerfTrainer:
 
     Nerfstudio's logs go to this run from now on, and no longer to earlier runs of this process.
     """
+    from enerf_ns.method.checkpoints import set_random_seed
     from enerf_ns.method.nerfstudio_seams import start_new_logs
 
-    random.seed(config.machine.seed)
-    np.random.seed(config.machine.seed)  # noqa: NPY002 - libraries draw from it
-    torch.manual_seed(config.machine.seed)
+    set_random_seed(config.machine.seed)
     start_new_logs()
     trainer: EnerfTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
@@ -179,10 +174,16 @@ def load_any_method(
             config.relative_model_dir = beside  # an absolute path, which is used in place of the folder of the run
         return config
 
+    def set_up_pipeline() -> tuple[TrainerConfig, Pipeline]:
+        return eval_setup(config_file, test_mode=test_mode, update_config_callback=stored_here)[:2]
+
     allow_numpy_scalars_in_checkpoints()  # of runs on the data of another parser, too
     try:
         with without_chatter():
-            return eval_setup(config_file, test_mode=test_mode, update_config_callback=stored_here)[:2]
+            try:
+                return set_up_pipeline()
+            except (AssertionError, FileNotFoundError):  # a run that trains may have replaced its checkpoint meanwhile
+                return set_up_pipeline()
     except (Exception, SystemExit) as error:  # the kind depends on what is missing, or of another version
         reason = " ".join(str(error).split()).removeprefix("enerf: ").rstrip(".") or type(error).__name__
         if isinstance(error, IndexError) or (isinstance(error, SystemExit) and isinstance(error.code, int)):

@@ -15,12 +15,13 @@ from tempfile import TemporaryFile
 from types import FrameType
 from typing import Any, Literal, Optional, Type  # noqa: UP035 - tyro reads these annotations on Python 3.10
 
+import numpy as np
 import torch
 import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
-from nerfstudio.utils.comms import is_main_process
+from nerfstudio.utils.comms import get_rank, is_main_process
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
@@ -52,6 +53,7 @@ from enerf_ns.method.checkpoints import (
     newest_checkpoint,
     random_state,
     read_config,
+    set_random_seed,
     set_random_state,
     write_checkpoint,
 )
@@ -113,11 +115,14 @@ class EnerfTrainerConfig(TrainerConfig):
     scored once at the end, in extra time. With 0 nothing is evaluated, not even at the end."""
 
     def __post_init__(self) -> None:
-        """Checks the config.yml of --load-config, since Nerfstudio would end with a traceback. Hands --data on, since
-        Nerfstudio would print that it does."""
+        """Checks the config.yml of --load-config, since Nerfstudio would end with a traceback, or train a run that was
+        moved from its start. Hands --data on, since Nerfstudio would print that it does."""
         if self.load_config is not None:
             with exit_with_a_sentence():
-                read_config(absolute(self.load_config))
+                self.load_config = absolute(self.load_config)
+                config = read_config(self.load_config)
+                if isinstance(config, EnerfTrainerConfig):
+                    config._check_place(self.load_config.parent)
         elif self.data is not None and self.pipeline.datamanager.data != self.data:
             self.pipeline = replace(self.pipeline, datamanager=replace(self.pipeline.datamanager, data=self.data))
             self.data = None
@@ -170,6 +175,23 @@ class EnerfTrainerConfig(TrainerConfig):
             config._check_fits(checkpoint)
         index_events(config.recording())
         return config
+
+    def _check_place(self, folder: Path) -> None:
+        """Checks that checkpoints beside config.yml are those of the folder that it states, where training continues.
+
+        Args:
+            folder: Folder of config.yml.
+
+        Raises:
+            FlagError: The run was moved or copied to that folder.
+        """
+        stated, beside = absolute(self.get_base_dir()), folder / self.relative_model_dir
+        if stated != folder and beside.is_dir():
+            raise FlagError(
+                f"--load-config continues the run in {stated}, but its checkpoints were moved or copied to {folder}; "
+                "move the run back, or train on in a new folder with the flags of the run and --load-dir "
+                f"{quoted(beside)}."
+            )
 
     def _check_output_dir(self) -> None:
         """Checks that the run's folder can be made, before anything that takes time.
@@ -255,10 +277,7 @@ class EnerfTrainerConfig(TrainerConfig):
         if own and self.pipeline.resolution.choices:
             return own
         if own and self.load_dir != folder:
-            raise OutputError(
-                f"{folder.parent} holds a run already; continue it with --load-config "
-                f"{quoted(folder.parent / 'config.yml')}, or give the new one another --timestamp."
-            )
+            raise _taken(folder.parent)
         if self.load_dir and self.load_step is None:
             try:
                 path = newest_checkpoint(self.load_dir)
@@ -304,7 +323,13 @@ class EnerfTrainerConfig(TrainerConfig):
         """Prints nothing: `save_config` prints the choices as a table, and config.yml holds all settings."""
 
     def save_config(self) -> None:
-        """Prints the recording and the choices for it, and stores config, choices and origin of the run."""
+        """Prints the recording and the choices for it, and stores config, choices and origin of the run.
+
+        A run that is continued keeps its origin.
+
+        Raises:
+            SystemExit: The run cannot be trained, or its folder holds another run; with one sentence.
+        """
         with exit_with_a_sentence():
             config = self.resolved()
             resolution = config.pipeline.resolution
@@ -325,6 +350,13 @@ class EnerfTrainerConfig(TrainerConfig):
                 ORIGIN_FILE: json.dumps(origin(), indent=2),
                 CHOICES_FILE: choices_text(resolution.choices, CHOICES_COLUMNS),
             }
+            is_loaded = bool(self.pipeline.resolution.choices)
+            if is_loaded and (folder / ORIGIN_FILE).exists():
+                del files[ORIGIN_FILE]
+            is_alone = self.machine.num_machines == 1  # the machines of one run may share its folder
+            is_new = is_alone and not is_loaded and config.load_dir != folder / config.relative_model_dir
+            if is_new and (folder / "config.yml").exists():  # of a run that started in the same second, say
+                raise _taken(folder)
             try:
                 write_together(folder, {name: text.encode() for name, text in files.items()})
             except OSError as error:
@@ -341,6 +373,13 @@ class EnerfTrainerConfig(TrainerConfig):
             config.data = None  # so that the viewer keeps camera paths with the run
             with without_chatter():
                 return self._target(config, **kwargs)
+
+
+def _taken(folder: Path) -> OutputError:
+    return OutputError(
+        f"{folder} holds a run already; continue it with --load-config {quoted(folder / 'config.yml')}, or give the "
+        "new one another --timestamp."
+    )
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:
@@ -360,6 +399,8 @@ class EnerfTrainer(Trainer):
 
     def __init__(self, config: EnerfTrainerConfig, local_rank: int = 0, world_size: int = 1):
         super().__init__(config, local_rank, world_size)
+        if config.machine.device_type == "cuda":
+            torch.cuda.set_device(self.device)  # else kernels and events of each process would be on the first GPU
         self.num_skipped = 0
         """Steps that were left out because they were not finite."""
         self._skipped_in_a_row = 0
@@ -404,10 +445,19 @@ class EnerfTrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._is_finite)
 
     def _resume(self, state: dict[str, Any]) -> None:
-        """Restores the state that only this class stores in a checkpoint. Nerfstudio has restored the rest before."""
-        if state["device"] == self.pipeline.device.type:
+        """Restores the state that only this class stores in a checkpoint. Nerfstudio has restored the rest before.
+
+        The states of generators are those of the first process. The others are seeded anew, or all would draw the same.
+        """
+        generator = self.pipeline.datamanager.generator
+        if not is_main_process():
+            seeds = np.random.SeedSequence([self.config.machine.seed + get_rank(), self._start_step])
+            seed = int(seeds.generate_state(1)[0])
+            set_random_seed(seed)
+            generator.manual_seed(seed)
+        elif state["device"] == self.pipeline.device.type:
             set_random_state(state["generators"], self.pipeline.device)
-            self.pipeline.datamanager.generator.set_state(state["generators"]["batches"])
+            generator.set_state(state["generators"]["batches"])
         set_sampler_counters(self.pipeline.model.sampler, state["sampler"])
         self._recorded = state["error_against_time"]
 
@@ -635,15 +685,19 @@ class EnerfTrainer(Trainer):
             numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in learned.items())
             say(f"Parameters of the sensor that were learned: {numbers}.")
         self._say_poses()
-        for what, where in {
-            "checkpoint": quoted(self.checkpoint_dir),
-            "scores, picture and video": f"enerf report {config}",
-            "scores alone": f"ns-eval --load-config {config} --output-path scores.json",
-            "video along the cameras": f"ns-render interpolate --load-config {config} --output-path video.mp4 "
-            "--rendered-output-names display",
-            "viewer": f"ns-viewer --load-config {config}",
-        }.items():
-            say_where(what, where)
+        say_where("checkpoint", quoted(self.checkpoint_dir))
+        say_where("scores, picture and video", f"enerf report {config}")
+        say_where("scores alone", f"ns-eval --load-config {config} --output-path scores.json")
+        manager = self.pipeline.datamanager
+        for dataset, flag in ((manager.eval_dataset, ""), (manager.train_dataset, " --pose-source train")):
+            if len(dataset) > 1:
+                say_where(
+                    "video along the cameras",
+                    f"ns-render interpolate --load-config {config} --output-path video.mp4 "
+                    f"--rendered-output-names display{flag}",
+                )
+                break
+        say_where("viewer", f"ns-viewer --load-config {config}")
         self._end_viewer("has ended")
 
     def _say_verdict(self) -> None:
@@ -658,7 +712,7 @@ class EnerfTrainer(Trainer):
     def _say_poses(self) -> None:
         """Prints the errors that were found in clock, poses and lens, and stores them with the run."""
         refiner, manager = self.pipeline.poses, self.pipeline.datamanager
-        if refiner is None or not refiner.looks:
+        if not refiner.looks:
             return
         found = findings(refiner, manager.distance)
         say_table(findings_table(found))

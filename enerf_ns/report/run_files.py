@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -27,8 +28,8 @@ RECENT_SECONDS = 600.0
 CHOICES_FILE = "choices.json"
 """Name of the file with the table of choices."""
 
-WRITTEN_BY_TRAINING = ("config.yml", HISTORY_FILE, "events.out.*", "previews/*", "nerfstudio_models/*")
-"""Patterns of the files that training writes into the folder of a run."""
+WRITTEN_BY_TRAINING = (HISTORY_FILE, "events.out.*", "previews/*", "nerfstudio_models/*")
+"""Patterns of the files that training writes into the folder of a run, beside its config."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class RunFiles:
     """Number of training steps done, according to the files."""
     stored: int
     """Number of training steps in the newest whole checkpoint; 0 if there is none."""
+    stored_seconds: float
+    """Time (s) of these steps."""
     state: str
     """In words: done, still going, stopped or crashed, with the number of steps."""
     notes: tuple[str, ...] = ()
@@ -58,13 +61,12 @@ class RunFiles:
         return self.config_file.parent
 
     def seconds_at(self, step: int) -> float:
-        """Time (s) of training up to a step: in proportion between rows of the history; after its last row, which must
-        be there, that of the newest checkpoint."""
-        if step > self.history[-1].step and step == self.stored:
-            newest = newest_checkpoint(self.folder / "nerfstudio_models")
-            if newest is not None:
-                return float(load_checkpoint(newest)["error_against_time"]["seconds"])
-        steps, seconds = ([getattr(row, name) for row in self.history] for name in ("step", "seconds"))
+        """Time (s) of training up to a step: in proportion between rows of the history, which must have one, and the
+        newest checkpoint."""
+        known = [(row.step, row.seconds) for row in self.history]
+        if self.stored > known[-1][0]:
+            known.append((self.stored, self.stored_seconds))
+        steps, seconds = zip(*known, strict=True)
         return float(np.interp(step, steps, seconds))
 
     @property
@@ -108,11 +110,14 @@ def read_run(path: Path) -> RunFiles:
             f"{config_file} is a run of the method {config.method_name}; give the folder of a run of enerf."
         )
     config = cast("EnerfTrainerConfig", config)
-    folder, notes, checkpoint = config_file.parent, [], None
+    folder, notes, stored, stored_seconds = config_file.parent, [], 0, 0.0
     with reading(folder / HISTORY_FILE, "the history of a run"):
         history = read_history(folder)
     try:
         checkpoint = newest_checkpoint(folder / "nerfstudio_models")
+        if checkpoint is not None:
+            stored = int(checkpoint.stem.removeprefix("step-")) + 1
+            stored_seconds = float(load_checkpoint(checkpoint)["error_against_time"]["seconds"])
     except RecordingError as error:
         notes.append(str(error))
     about: dict[str, Any] = {CHOICES_FILE: [], ORIGIN_FILE: {}}
@@ -123,12 +128,24 @@ def read_run(path: Path) -> RunFiles:
                     about[name] = json.loads((folder / name).read_text())
         except RecordingError as error:
             notes.append(str(error))
-    stored = int(checkpoint.stem.removeprefix("step-")) + 1 if checkpoint else 0
-    written = [file.stat().st_mtime for pattern in WRITTEN_BY_TRAINING for file in folder.glob(pattern)]
+    written = [config_file.stat().st_mtime]
+    for pattern in WRITTEN_BY_TRAINING:
+        for file in folder.glob(pattern):
+            with suppress(FileNotFoundError):  # training may have removed a checkpoint meanwhile
+                written.append(file.stat().st_mtime)
     state = _state(config, history, stored, time.time() - max(written))
     steps = max([stored, *(row.step for row in history)])
     return RunFiles(
-        config_file, config, history, steps, stored, state, tuple(notes), about[CHOICES_FILE], about[ORIGIN_FILE]
+        config_file,
+        config,
+        history,
+        steps,
+        stored,
+        stored_seconds,
+        state,
+        tuple(notes),
+        about[CHOICES_FILE],
+        about[ORIGIN_FILE],
     )
 
 

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
     from enerf_ns.method.pipeline import EnerfPipeline
 
+LEFT_OUT = "so pictures, video and new scores are left out"
+"""Words on a run whose field or recording cannot be read."""
+
 
 def write_report(
     runs: Sequence[Run | Path],
@@ -138,82 +141,96 @@ def _look_at(one: Reported, run: Run | None, output_dir: Path, scoring: Scoring,
         one.step = one.files.steps
     if run is None:
         run = _loaded(one)
-    if run is not None:
-        dataset = run.pipeline.datamanager.eval_dataset
-        camera = dataset.recording.camera
-        one.events, one.sensor = len(index_events(dataset.recording)), f"{camera.width} x {camera.height} pixels"
-        one.sensor += f", {camera.model}"
-        shown = shown_numbers(len(dataset))
-        anew = not at_end or scoring != DEFAULT_SCORING
-        views, summary = held_out_views(run.pipeline, None if anew else shown)
-        stored = int(run.config.load_step or 0) + 1
-        if anew:
-            one.step, one.over_all_frames = stored, True
-            one.num_frames = sum(view.recorded is not None for view in views)
-            one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
-            one.protocol = one.scores.pop("protocol")
-            views = [views[number] for number in shown]
-        figure = corrections_over_time(dataset.recording)
-        if figure is not None:
-            one.corrections, one.at_stated_poses = _png(figure), scores_at_stated_poses(run.pipeline)
-        refiner, distance = run.pipeline.poses, run.pipeline.datamanager.distance
-        if refiner is not None and refiner.looks:
-            one.poses = [row.as_dict() for row in findings(refiner, distance)]
-        is_panorama = run.pipeline.model.config.panorama
-        screen = Screen.of(views, None if is_panorama else run.pipeline.datamanager.depth_range)
-        if is_panorama:
-            one.notes.append(
-                "The camera only turned, so that the run is a panorama: it has no depth, no mesh and no scores of "
-                "depth, and its pictures are right only for views from where the camera was."
-            )
-        views, _ = aligned_views(views, scoring.protocol, encoded=False)
-        one.columns = columns_of(views, dataset.recording, screen.exponent)
-        one.caption = _caption(shown, len(dataset), stored, dataset.are_frames, screen)
-        picture = _png(side_by_side(one.columns, views))
-        path = camera_path(dataset.cameras)
-        one.picture = f"{one.prefix}side-by-side.png", picture
-        with _writing_to(output_dir):
-            write_together(
-                output_dir,
-                {one.picture[0]: picture, f"{one.prefix}camera_path.json": json.dumps(path).encode()},
-            )
-            if video:
-                folder = output_dir / one.prefix
-                render_moving(run.pipeline, screen, folder / "moving.webp")
-                render_video(run.pipeline, screen, path, folder / "video.mp4")
-                one.video_note = f"Flight past the held-out cameras: {screen.gamma}."
-                if not is_panorama:
-                    one.video_note = one.video_note[:-1] + " on the left, depth on the right."
-                one.moving, one.video = ((folder / name).read_bytes() for name in ("moving.webp", "video.mp4"))
-                one.poster = poster_of(folder / "video.mp4")
-                one.mesh = None if is_panorama else _turning_mesh(one, run.pipeline)
-                if one.mesh is not None:
-                    write_whole(folder / "mesh.webp", one.mesh)
-    else:
+    if run is None:
         _take_preview(one)
+    else:
+        try:
+            _look_at_field(one, run, at_end, output_dir, scoring, video)
+        except RecordingError as error:  # of a frame, say, which is read only here
+            one.notes.append(f"{str(error).rstrip('.')}; {LEFT_OUT}.")
+            _take_preview(one)
     if history:
         one.seconds = one.files.seconds_at(one.step)
     elif run is not None:
         one.seconds = run.train_seconds
 
 
+def _look_at_field(one: Reported, run: Run, at_end: bool, output_dir: Path, scoring: Scoring, video: bool) -> None:
+    """Fills in what a loaded run shows. Its field is scored, too, unless the history has scores at its end.
+
+    Raises:
+        RecordingError: A file of the recording cannot be read.
+        FlagError: The crop of the scoring is larger than the frames.
+        OutputError: The folder cannot be written to, or the disk is full.
+    """
+    dataset = run.pipeline.datamanager.eval_dataset
+    camera = dataset.recording.camera
+    one.events, one.sensor = len(index_events(dataset.recording)), f"{camera.width} x {camera.height} pixels"
+    one.sensor += f", {camera.model}"
+    shown = shown_numbers(len(dataset))
+    anew = not at_end or scoring != DEFAULT_SCORING
+    views, summary = held_out_views(run.pipeline, None if anew else shown)
+    stored = int(run.config.load_step or 0) + 1
+    if anew:
+        one.step, one.over_all_frames = stored, True
+        one.num_frames = sum(view.recorded is not None for view in views)
+        one.scores = summary_scores(views, summary, False, scoring.protocol, scoring.lpips, scoring.crop)
+        one.protocol = one.scores.pop("protocol")
+        views = [views[number] for number in shown]
+    figure = corrections_over_time(dataset.recording)
+    if figure is not None:
+        one.corrections, one.at_stated_poses = _png(figure), scores_at_stated_poses(run.pipeline)
+    refiner, distance = run.pipeline.poses, run.pipeline.datamanager.distance
+    if refiner.looks:
+        one.poses = [row.as_dict() for row in findings(refiner, distance)]
+    is_panorama = run.pipeline.model.config.panorama
+    screen = Screen.of(views, None if is_panorama else run.pipeline.datamanager.depth_range)
+    if is_panorama:
+        one.notes.append(
+            "The camera only turned, so that the run is a panorama: it has no depth, no mesh and no scores of "
+            "depth, and its pictures are right only for views from where the camera was."
+        )
+    views, _ = aligned_views(views, scoring.protocol, encoded=False)
+    one.columns = columns_of(views, dataset.recording, screen.exponent)
+    one.caption = _caption(shown, len(dataset), stored, dataset.are_frames, screen)
+    picture = _png(side_by_side(one.columns, views))
+    path = camera_path(dataset.cameras)
+    one.picture = f"{one.prefix}side-by-side.png", picture
+    with _writing_to(output_dir):
+        write_together(
+            output_dir,
+            {one.picture[0]: picture, f"{one.prefix}camera_path.json": json.dumps(path).encode()},
+        )
+        if video:
+            folder = output_dir / one.prefix
+            render_moving(run.pipeline, screen, folder / "moving.webp")
+            render_video(run.pipeline, screen, path, folder / "video.mp4")
+            one.video_note = f"Flight past the held-out cameras: {screen.gamma}."
+            if not is_panorama:
+                one.video_note = one.video_note[:-1] + " on the left, depth on the right."
+            one.moving, one.video = ((folder / name).read_bytes() for name in ("moving.webp", "video.mp4"))
+            one.poster = poster_of(folder / "video.mp4")
+            one.mesh = None if is_panorama else _turning_mesh(one, run.pipeline)
+            if one.mesh is not None:
+                write_whole(folder / "mesh.webp", one.mesh)
+
+
 def _loaded(one: Reported) -> Run | None:
     """The loaded run. If it cannot be loaded, None, and a note with the reason is added."""
-    left_out = "so pictures, video and new scores are left out"
     recording = one.files.config.data
     if recording is not None and not recording.exists():
         one.notes.append(
-            f"The recording {recording} is not there any more, {left_out}; put it back, or a link to it (ln -s NEW "
+            f"The recording {recording} is not there any more, {LEFT_OUT}; put it back, or a link to it (ln -s NEW "
             f"{quoted(recording)}), and run enerf report again."
         )
         return None
     if not one.files.stored:
-        one.notes.append(f"No whole checkpoint is stored, {left_out}; wait for one, or train again.")
+        one.notes.append(f"No whole checkpoint is stored, {LEFT_OUT}; wait for one, or train again.")
         return None
     try:
         return load(one.files.config_file)
     except RecordingError as error:
-        one.notes.append(f"{str(error).rstrip('.')}; {left_out}.")
+        one.notes.append(f"{str(error).rstrip('.')}; {LEFT_OUT}.")
         return None
 
 

@@ -22,7 +22,7 @@ COMMANDS = {
     "bench": ("Bench", "train and score the rows of a table, such as those of the paper"),
     "check-numerics": ("CheckNumerics", "check the numerical errors of extreme cases"),
     "convert": ("Convert", "write a recording or an event file in the format of this package"),
-    "demo": ("Demo", "simulate, train, and report with a video, in five minutes"),
+    "demo": ("Demo", "simulate, train, and report with a video, in some minutes"),
     "export": ("Export", "write a mesh, points, splats or the refined poses of a run"),
     "fetch-lpips": ("FetchLpips", "download the weights that the score LPIPS needs"),
     "inspect": ("Inspect", "check a recording before training on it"),

@@ -26,7 +26,7 @@ class RefractoryPeriodConfig(SensorPartConfig):
     that the shortest intervals between events show."""
     learn_refractory_period: bool = False
     """Learn the refractory period, starting from refractory-period-ns. Each step then takes longer, since rays have
-    gradients."""
+    gradients, and sums of events are not completed by what pixels missed, which would keep the starting period."""
 
 
 class RefractoryPeriod(SensorPart):

@@ -25,6 +25,7 @@ from small_runs import set_up, small_config
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import partial_of
+from enerf_ns.method import checkpoints
 from enerf_ns.method.checkpoints import is_whole, newest_checkpoint, random_state, set_random_state, write_checkpoint
 
 SAVE = "import numpy as np, torch; torch.save({'lr': np.float64(0.01), 'other': np.float32(2.0)}, %r)"
@@ -111,6 +112,18 @@ def test_the_newest_whole_checkpoint_is_used(copy: Path, capsys, damage: Callabl
     trainer.train()
     assert [file.name for file in (copy / "nerfstudio_models").glob("*3.ckpt")] == ["step-000000003.ckpt"]
     assert eval_setup(copy / "config.yml")[3] == 3
+
+
+def test_a_checkpoint_that_training_replaces_while_it_is_read_is_not_damaged(copy: Path, capsys, monkeypatch):
+    def while_training(path: Path) -> bool:
+        if path.name == "step-000000002.ckpt":
+            for file in sorted(path.parent.iterdir()):
+                file.replace(file.with_name("step-000000003.ckpt"))
+        return is_whole(path)
+
+    monkeypatch.setattr(checkpoints, "is_whole", while_training)
+    assert newest_checkpoint(copy / "nerfstudio_models") == copy / "nerfstudio_models/step-000000003.ckpt"
+    assert not capsys.readouterr().out
 
 
 def test_where_none_is_whole_it_is_one_sentence(copy: Path):

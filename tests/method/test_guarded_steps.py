@@ -153,6 +153,19 @@ def test_a_sound_run_leaves_nothing_out(recording: Path, tmp_path: Path, capsys)
     assert "left out, since" not in capsys.readouterr().out
 
 
+def test_an_optimiser_that_a_checkpoint_makes_another_leaves_out_steps(recording: Path, tmp_path: Path, breaking):
+    """A checkpoint of Adam in a loop states so, and its settings replace those of the config."""
+    trainer = breaking(small_config(recording, tmp_path), {1}, nan_loss)
+    state = trainer.optimizers.optimizers["fields"].state_dict()
+    state["param_groups"][0]["fused"] = None
+    trainer.optimizers.load_optimizers({"fields": state})
+    states = [learnt(trainer)]
+    for step in range(2):
+        trainer.train_iteration(step)
+        states.append(learnt(trainer))
+    assert [equal(a, b) for a, b in pairwise(states)] == [False, True]
+
+
 def test_gradients_that_are_gathered_over_steps_begin_again(recording: Path, tmp_path: Path, breaking):
     config = small_config(recording, tmp_path)
     config.gradient_accumulation_steps = {"fields": 2}

@@ -310,6 +310,17 @@ def test_normals_of_a_picture_are_those_of_its_rays(pipeline: Any):
     pipeline.train()
 
 
+def test_depth_that_is_scaled_in_place_changes_neither_normals_nor_confidence(pipeline: Any):
+    """As `ns-render dataset` scales raw-depth before it reads the outputs that are named behind it."""
+    pipeline.eval()
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    picture, other = (pipeline.model.get_outputs_for_camera(camera) for _ in range(2))
+    other["depth"].div_(3.0)
+    for name in ("normals", "confidence"):
+        assert torch.equal(other[name], picture[name]) and picture[name].std() > 0
+    pipeline.train()
+
+
 def test_a_picture_without_depth_is_shown(pipeline: Any):
     zeros = torch.zeros(12, 12, 1)
     outputs = {"rgb": torch.rand(12, 12, 3), "depth": zeros, "accumulation": zeros}

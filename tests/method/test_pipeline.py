@@ -12,6 +12,7 @@ import pytest
 import torch
 from small_runs import set_up, small_config
 
+from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.sensor_estimates import estimates as sensor_estimates
 from enerf_ns.dataparsers.sensor_estimates.estimates import noise_per_event, threshold_differences
@@ -113,6 +114,41 @@ def test_only_wide_cells_have_a_say_in_poses(pipeline: Any, monkeypatch):
         pipeline._refine_poses(pipeline.poses, batch, 100)
         said.append(pipeline.poses.normal.diagonal()[: pipeline.poses.number].abs().max())
     assert said[0] > 0.0 and said[1] == 0.0
+
+
+def test_frames_alone_are_rendered_at_the_clock_that_is_stated(recording: Path, tmp_path: Path):
+    config = small_config(recording, tmp_path, data__supervision="frames")
+    config.pipeline.poses.clock_ms, config.pipeline.poses.frame_delay_ms = 5.0, 2.0
+    manager = config.resolved().pipeline.setup(device="cpu").datamanager
+    read, frames = read_recording(recording).trajectory, manager.train_dataset.frames
+    late = torch.from_numpy(frames.times) + 5_000_000
+    inside = (late >= read.start + 5_000_000) & (late <= read.end)
+    found = manager.frame_camera.trajectory.poses(torch.from_numpy(frames.times)[inside])
+    torch.testing.assert_close(found, read.poses(late[inside]), rtol=0, atol=1e-4)
+    recorded = read_recording(recording).frames
+    assert recorded is not None and set(frames.times + 2_000_000) < set(recorded.times)
+
+
+def test_several_devices_keep_the_corrections_before_training(recording: Path, tmp_path: Path, capsys):
+    """As a run of theirs that one device reads back does."""
+    config = small_config(recording, tmp_path)
+    config.pipeline.poses.clock_ms = 5.0
+    resolved = config.resolved().pipeline
+    one = resolved.setup(device="cpu")
+    assert "several devices" not in capsys.readouterr().out
+    torch.distributed.init_process_group("gloo", f"file://{tmp_path / 'meet'}", rank=0, world_size=1)
+    try:
+        several = resolved.setup(device="cpu", world_size=2)
+        assert "several devices" in capsys.readouterr().out
+        for made, looks in ((one, 1), (several, 0)):
+            made.num_steps = 1000
+            made.get_train_loss_dict(100)
+            assert made.poses.looks == looks and made.datamanager.corrections.delay == 5.0
+        stored = several.state_dict()
+    finally:
+        torch.distributed.destroy_process_group()
+    one.load_pipeline(stored, 1)
+    assert one.poses.looks == 0 and one.datamanager.corrections.delay == 5.0
 
 
 @pytest.mark.parametrize(("mode", "blind", "starts"), [("val", 0, True), ("test", 0, False), ("val", 1000, False)])

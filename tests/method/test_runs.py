@@ -14,6 +14,7 @@ from small_runs import SMALL
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.method import runs
 from enerf_ns.method.datamanager import EnerfDataManagerConfig
+from enerf_ns.method.pipeline import EnerfPipelineConfig
 from enerf_ns.method.runs import Run, load, method_config, set_up
 
 
@@ -103,6 +104,26 @@ def test_of_a_run_that_was_copied_or_moved_the_checkpoint_beside_it_is_loaded(ru
         changed = parameters(load(copied / "config.yml").pipeline)[name]
         torch.testing.assert_close(changed, parameters(run.pipeline)[name] + 1.0)
         shutil.rmtree(trained, ignore_errors=True)
+
+
+def test_a_run_is_loaded_though_training_replaces_its_checkpoint_meanwhile(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "run"
+    shutil.copytree(run.config_file.parent, folder)
+    (first,) = (folder / "nerfstudio_models").iterdir()
+    set_up_pipeline = EnerfPipelineConfig.setup
+
+    def while_training(*args, **kwargs):
+        if first.exists():
+            first.rename(first.with_name("step-000000002.ckpt"))
+        return set_up_pipeline(*args, **kwargs)
+
+    monkeypatch.setattr(EnerfPipelineConfig, "setup", while_training)
+    loaded = load(folder / "config.yml")
+    assert loaded.config.load_step == 2 and not first.exists()
+    ours = parameters(loaded.pipeline)
+    assert all(torch.equal(value, ours[name]) for name, value in parameters(run.pipeline).items())
 
 
 def no_checkpoints(folder: Path) -> None:

@@ -134,6 +134,20 @@ def test_the_tables_name_what_there_is(recording: Path, tmp_path: Path):
         assert expected in text
 
 
+@pytest.mark.parametrize(("end", "flag"), [(0.1, ""), (0.03, " --pose-source train")])
+def test_the_video_along_the_cameras_is_along_more_than_one(
+    recording: Path, tmp_path: Path, capsys, end: float, flag: str
+):
+    """Of the three held-out frames, one is in the first 0.03 s, which Nerfstudio cannot interpolate."""
+    config = small_config(recording, tmp_path)
+    config.pipeline.datamanager.dataparser.time_range = 0.0, end
+    trainer = set_up(config)
+    trainer.train()
+    assert len(trainer.pipeline.datamanager.eval_dataset) == (1 if flag else 3)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("video along the cameras: ")]
+    assert line.endswith(f"config.yml --output-path video.mp4 --rendered-output-names display{flag}")
+
+
 def test_a_run_is_the_same_on_any_number_of_threads(recording: Path, tmp_path: Path):
     before, parameters = torch.get_num_threads(), []
     try:

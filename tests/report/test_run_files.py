@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from enerf_ns.dataparsers.recording.errors import RecordingError
@@ -88,6 +89,27 @@ def test_a_run_whose_last_line_or_checkpoint_is_half_written_is_what_it_was_befo
     read = read_run(folder)
     assert [row.step for row in read.history] == [1]
     assert read.stored == 2 and checkpoint.name.endswith("1.ckpt")
+
+
+def test_seconds_are_those_of_the_files_as_they_were_read(copy_run: CopyRun):
+    """Though training stores a newer checkpoint then. In proportion between two rows, and behind the last one."""
+    folder = copy_run("run", 11, max_num_iterations=5000)
+    for row in (HistoryRow(2, 1.0), HistoryRow(6, 3.0)):
+        append_row(folder, row)
+    (checkpoint,) = (folder / "nerfstudio_models").iterdir()
+    state = torch.load(checkpoint)
+    state["error_against_time"]["seconds"] = 13.0
+    torch.save(state, checkpoint)
+    read = read_run(folder)
+    state["error_against_time"]["seconds"] = 99.0
+    torch.save(state, checkpoint_path(checkpoint.parent, 20))
+    checkpoint.unlink()
+    assert [read.seconds_at(step) for step in (2, 4, 6, 7, 11)] == [1.0, 2.0, 3.0, 5.0, 13.0]
+
+
+def test_a_config_alone_is_a_run_of_no_step(copy_run: CopyRun, tmp_path: Path):
+    shutil.copy(copy_run("run") / "config.yml", tmp_path / "other.yml")
+    assert read_run(tmp_path / "other.yml").state == "still going, 0 of 2 steps"
 
 
 def test_a_history_that_cannot_be_read_is_one_sentence(copy_run: CopyRun):

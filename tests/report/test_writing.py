@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -259,6 +260,21 @@ def test_a_run_that_cannot_be_read_is_a_row_and_stops_no_other(moved: Path, tmp_
     assert str(tmp_path / "empty | <b>") in [cell.strip() for cell in cells]
     table = [line for line in (tmp_path / "report/report.md").read_text().splitlines() if line.startswith("|")]
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table[:5]}) == 1, "a name breaks no row"
+
+
+def test_a_run_whose_frame_is_damaged_has_a_note_and_stops_no_other(run: Run, recording: Path, tmp_path: Path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(recording, damaged)
+    frame = damaged / "images/00006.png"
+    frame.write_bytes(frame.read_bytes()[: frame.stat().st_size // 2])
+    pipeline = deepcopy(run.config.pipeline)
+    pipeline.datamanager.data = pipeline.datamanager.dataparser.data = damaged
+    bad = copied(run, tmp_path / "bad", history(False)[:1], data=damaged, pipeline=pipeline)
+    other, good = write_report([bad, run], tmp_path / "report", video=False).values()
+    assert good["step"] == 2 and {"psnr", "correlation"} <= set(good)
+    assert (other["step"], other["psnr"], other["train_seconds"]) == (1, 10.0, 1.0)
+    text = (tmp_path / "report/report.md").read_text()
+    assert re.search(rf"^{frame} .*; so pictures, video and new scores are left out\.$", text, re.MULTILINE)
 
 
 def test_where_no_run_can_be_read_nothing_is_written(tmp_path: Path):
