@@ -244,7 +244,7 @@ def is_in_focus(recording: EventRecording, distance: float) -> bool:
     others, as_stated = [trials.height(Hypothesis(delay)) for delay in delays], heights[AS_READ]
     if not (is_clear or focus.has_strong_edges or _is_as_sharp_as_can_be(focus, as_stated, others)):
         return False
-    if _is_unsharp(focus, max(as_stated, *others)):
+    if _is_unsharp(focus, max([as_stated, *others])):
         return False
     if focus.turn >= SMALLEST_TURN:
         others += [trials.height(Hypothesis(focal_scale=lens)) for lens in NEAR_AND_FAR_LENSES if focus.allows(lens)]
@@ -678,7 +678,8 @@ def _best_delay(curve: Callable[[np.ndarray], np.ndarray], largest: int) -> Esti
     best = int(delays[curves.sum(1).argmax()])
     around = np.arange(best - FINE_REACH, best + FINE_REACH + 1, FINE_STEP)
     around = np.setdiff1d(around[np.abs(around) <= largest], delays)
-    curves, delays = np.concatenate([curves, curve(around)]), np.append(delays, around)
+    if len(around):
+        curves, delays = np.concatenate([curves, curve(around)]), np.append(delays, around)
     order = np.argsort(delays)
     found = _estimate(delays[order] / MILLISECOND, curves[order], FINE_REACH / MILLISECOND, LARGEST_DELAY_ERROR)
     within = MILLISECOND * abs(found.value) <= largest - FINE_REACH

@@ -70,10 +70,10 @@ def why_depths_do_not_fit(recording: EventRecording, depth_range: tuple[float, f
     if not parallax.contradicts(depth_range):
         return None
     shown = "{:.3g} m to {:.3g} m".format(*parallax.depth_range)
-    return (
-        f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; leave out "
-        "--depth-range, or state it in the unit of the poses"
-    )
+    advice = "leave out --depth-range, or state it in the unit of the poses"
+    if depth_range == recording.depth_range:
+        advice = "give --depth-range in the unit of the poses, or correct the range that the recording states"
+    return f"the depth range is {near:.3g} m to {far:.3g} m, but the parallax of the events shows {shown}; {advice}"
 
 
 def _contradiction(recording: EventRecording, depth_range: tuple[float, float] | None) -> Problem | None:

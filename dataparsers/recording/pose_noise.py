@@ -55,14 +55,15 @@ def pose_noise(given: Trajectory) -> PoseNoise | None:
     turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
     quaternions = quaternions * np.where(np.cumsum(np.append(False, turned)) % 2, -1.0, 1.0)[:, None]
     positions, position = _smoothed(times, given.positions)
-    rotations, rotation = _smoothed(times, quaternions)
+    rotations, quaternion = _smoothed(times, quaternions)
+    rotation = 2.0 * float(np.sqrt(4.0 / 3.0)) * quaternion  # noise moves a quaternion in three of four directions
     smooth = Trajectory(times, positions, rotations)
     if given.body is not None:
         body, mount = given.body
         camera_from_body = np.linalg.inv(mount)
         smooth_body = smooth.of_mounted(camera_from_body)
         smooth.body = Trajectory(body.times, smooth_body.positions, smooth_body.quaternions), mount
-    return PoseNoise(position, 2.0 * rotation, smooth)
+    return PoseNoise(position, rotation, smooth)
 
 
 def _smoothed(

@@ -10,6 +10,7 @@ from enerf_ns.choices.scene import DATAPARSER, Scene, path_extent
 from enerf_ns.dataparsers.index.indexing import describe_gaps
 from enerf_ns.dataparsers.inspection.agreement import Estimate, clock_of_frames
 from enerf_ns.dataparsers.inspection.agreement import clock_and_lens as sharpest_clock_and_lens
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.pose_noise import PoseNoise, pose_noise
 from enerf_ns.dataparsers.recording.recording import EventRecording, percent
 from enerf_ns.dataparsers.scene.depth_range import recording_parallax
@@ -111,8 +112,18 @@ class _Start:
 
 
 def clock_and_lens(scene: Scene) -> None:
-    """Which errors of clock, mount, lens and drift are corrected, before and during training?"""
+    """Which errors of clock, mount, lens and drift are corrected, before and during training?
+
+    Raises:
+        FlagError: A flag asks for a correction by events, which the field does not learn from.
+    """
     poses, refines = scene.config.poses, scene.defaults.refines_poses and scene.use_events
+    wanted = [part for part in PARTS if getattr(poses, f"refine_{part}")]
+    if wanted and not scene.use_events:
+        raise FlagError(
+            f"--pipeline.refine-{wanted[0]} True compares events with renderings, but the field learns from frames "
+            "alone; leave it out, or give --pipeline.datamanager.supervision events+frames."
+        )
     is_blind = scene.use_events and scene.once(hides_changes)
     stated = {"clock": poses.clock_ms, "lens": poses.focal_scale}
     for part in PARTS:
@@ -147,12 +158,19 @@ def clock_and_lens(scene: Scene) -> None:
 
 
 def corrected_recording(scene: Scene) -> EventRecording:
-    """The recording with the corrections before training, which `clock_and_lens` decides."""
-    return Corrections(
-        delay=scene.value("poses.clock_ms"),
-        frame_delay=scene.value("poses.frame_delay_ms"),
-        focal_scale=scene.value("poses.focal_scale"),
-    ).recording(scene.recording)
+    """The recording with the corrections before training, which `clock_and_lens` decides.
+
+    Raises:
+        FlagError: The lens has no inverse with the focal length that a flag states.
+    """
+    recording, scale = scene.recording, scene.value("poses.focal_scale")
+    delay, frame_delay = scene.value("poses.clock_ms"), scene.value("poses.frame_delay_ms")
+    corrections = Corrections(delay, frame_delay, focal_scale=scale)
+    try:
+        corrections.camera(recording.camera)
+    except ValueError as error:
+        raise FlagError(f"--pipeline.focal-scale {scale:g} gives {recording.path} {error}") from error
+    return corrections.recording(recording)
 
 
 def _start(scene: Scene, with_clock: bool, with_lens: bool) -> _Start:
@@ -185,7 +203,7 @@ def _start(scene: Scene, with_clock: bool, with_lens: bool) -> _Start:
         if _is_wrong(delay, 0.0, SMALLEST_DELAY):
             start.clock = delay.value
             start.on_clock.append(f"poses are stamped {delay.value:+.2f} ± {delay.error:.2f} ms late")
-    turns = scene.config.poses.refine_lens or turns_about_two_axes(recording.trajectory)
+    turns = scene.config.poses.refine_lens or turns_about_two_axes(recording)
     if with_lens and turns and _is_wrong(lens, 1.0, SMALLEST_SCALE):
         start.scale = lens.value
         start.on_lens.append(f"the focal length is {lens.value:.3f} ± {lens.error:.3f} of the stated one")

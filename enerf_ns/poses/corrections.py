@@ -153,14 +153,12 @@ class Corrections:
         grown = 1e-3 * self.delay_rate * (times - _middle(given))
         return times + round(MILLISECOND * self.delay) + grown.round().astype(np.int64)
 
-    def _inner_times(self, given: Trajectory, own: Trajectory) -> Int64[np.ndarray, " poses"]:
-        """Times (ns) of a camera's own poses on the clock of the events, within the span of its poses, and the two ends
-        of this span."""
+    def _knots(self, given: Trajectory, own: Trajectory, start: int, end: int) -> Int64[np.ndarray, " poses"]:
+        """Times (ns) of a camera's own poses on the clock of the events, from a start to an end, and these two."""
         middle = _middle(given)
         since = (own.times - middle - round(MILLISECOND * self.delay)) / (1.0 + 1e-3 * self.delay_rate)
         times = np.unique(middle + since.round().astype(np.int64))
-        inside = times[(times > own.start) & (times < own.end)]
-        return np.concatenate([[own.start], inside, [own.end]])
+        return np.concatenate([[start], times[(times > start) & (times < end)], [end]])
 
     def poses(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:
         """Poses of the event camera at any times (ns). Beyond the given poses, it moves on at its last speed."""
@@ -180,7 +178,7 @@ class Corrections:
         if not self.moves_poses:
             return given
         if self._made is None or self._made[0] is not given:
-            times = self._inner_times(given, given)
+            times = self._knots(given, given, given.start, given.end)
             object.__setattr__(self, "_made", (given, _trajectory(times, self.poses(given, times))))
         assert self._made is not None
         return self._made[1]
@@ -188,23 +186,33 @@ class Corrections:
     def frames(self, given: Frames, recording: EventRecording) -> Frames:
         """Corrected frames of a recording, on the clock of its events.
 
-        If frames come from another camera, it keeps its lens and its pose relative to the event camera.
+        If frames come from another camera, it keeps its lens and its pose relative to the event camera. The trajectory
+        of frames whose exposures are corrected to beyond the poses reaches as far as they do.
 
         Args:
             given: Frames within the poses.
             recording: As it was read.
         """
+        start, end = given.trajectory.start, given.trajectory.end
+        if self.frame_delay:
+            exposed = given.exposed - round(MILLISECOND * self.frame_delay)
+            start, end = min(start, int(exposed.min())), max(end, int(exposed.max()))
+        return self._frames(given, recording, start, end)
+
+    def _frames(self, given: Frames, recording: EventRecording, start: int, end: int) -> Frames:
+        """Corrected frames, as `frames` has them, with a trajectory from a start to an end (ns)."""
         of_events, of_frames = recording.trajectory, given.trajectory
         camera = self.camera(given.camera) if given.camera == recording.camera else given.camera
-        times = given.times - round(MILLISECOND * self.frame_delay)
-        found = replace(given, camera=camera, times=times.clip(of_frames.start, of_frames.end))
-        if not self.moves_poses:
-            return found
-        if of_frames is of_events:
-            return replace(found, trajectory=self.trajectory(of_events))
-        knots = self._inner_times(of_events, of_frames)
-        stamped, poses = self.stamped(of_events, knots), self.poses(of_events, knots)
-        before, own = poses_at(of_events, stamped), poses_at(of_frames, stamped)
+        found = replace(given, camera=camera, times=given.times - round(MILLISECOND * self.frame_delay))
+        if (start, end) == (of_frames.start, of_frames.end):
+            if not self.moves_poses:
+                return found
+            if of_frames is of_events:
+                return replace(found, trajectory=self.trajectory(of_events))
+        knots = self._knots(of_events, of_frames, start, end)
+        poses, between = self.poses(of_events, knots), (of_frames.times[1:] + of_frames.times[:-1]) // 2
+        nearest = of_frames.times[np.searchsorted(between, self.stamped(of_events, knots))]
+        before, own = poses_at(of_events, nearest), poses_at(of_frames, nearest)
         back = before[:, :, :3].transpose(0, 2, 1)
         mount = back @ np.concatenate([own[:, :, :3], own[:, :, 3:] - before[:, :, 3:]], axis=2)
         moved = poses[:, :, :3] @ mount
@@ -212,11 +220,15 @@ class Corrections:
         return replace(found, trajectory=_trajectory(knots, moved))
 
     def recording(self, given: EventRecording) -> EventRecording:
-        """The recording with corrected camera, poses and frames. Events and frames come from the same files."""
+        """The recording with corrected camera, poses and frames. Events and frames come from the same files.
+
+        Frames that are corrected to beyond the poses are left out.
+        """
         if not (self.moves_poses or self.changes_lens or self.frame_delay):
             return given
         frames, blurred = (
-            None if kind is None else self.frames(kind, given) for kind in (given.frames, given.blurred_frames)
+            None if kind is None else self._frames(kind, given, kind.trajectory.start, kind.trajectory.end)
+            for kind in (given.frames, given.blurred_frames)
         )
         return replace(
             given,

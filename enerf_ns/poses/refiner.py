@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -21,7 +22,6 @@ from torch import Tensor, nn
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.recording import EventRecording
-from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.poses.corrections import Corrections, Drift, DriftBasis
 
 Part = str
@@ -101,6 +101,9 @@ FINEST_SLOPES = math.radians(0.6)
 """Angle (radians) that the smallest cells of the hash grid whose slopes count take up at a usual distance. Poses are
 wrong by some tenths of a degree, and the slope of a finer detail does not reach as far."""
 
+INSTANTS = 256
+"""Number of instants at which the turn of the camera is measured."""
+
 SMALLEST_TURN = math.radians(2.0)
 """Smallest root mean square turn of the camera about its second axis (radians) with which mount and lens are corrected
 by default."""
@@ -121,6 +124,9 @@ LIMITS: dict[Part, tuple[float, str]] = {
     "noise": (20.0, "the noise of the poses would have to be more than 12 times what was taken off"),
 }
 """Largest plausible corrections, in their units, and the clause of the error message about a larger one."""
+
+DISTORTED = "the lens would have to have a distortion that the calibration does not state"
+"""The clause of the error message about a larger distortion, or about one that makes pixels see no direction."""
 
 MIDDLE_GREY = 0.3
 """Brightness behind the scene, where accumulation is below 1."""
@@ -207,19 +213,18 @@ class PoseRefiner(nn.Module):
     def __init__(self, config: RefinerConfig, recording: EventRecording):
         super().__init__()
         self.config, self.recording = config, recording
-        trajectory = recording.trajectory
-        pieces = round(1e-9 * (trajectory.end - trajectory.start) / PIECE_SECONDS)
-        pieces = min(max(pieces, FEWEST_PIECES), MOST_PIECES)
-        self.basis = DriftBasis(trajectory.start, trajectory.end, pieces)
+        start, end = recording.span
+        pieces = min(max(round(1e-9 * (end - start) / PIECE_SECONDS), FEWEST_PIECES), MOST_PIECES)
+        self.basis = DriftBasis(start, end, pieces)
         has_coefficients = recording.camera.model != "lookup"
         sizes: dict[Part, int] = {"clock": 1, "rate": 1, "rotation": 3, "translation": 3, "lens": 1 + has_coefficients}
         sizes["drift"] = 6 * self.basis.size
         taken_off, noise_units = recording.pose_noise_taken_off, np.zeros(0)
         self.noise_basis: DriftBasis | None = None
         if taken_off is not None and config.refine_drift is not False:
-            wanted_pieces = (trajectory.end - trajectory.start) / (NOISE_POSES * np.median(np.diff(trajectory.times)))
+            wanted_pieces = (end - start) / (NOISE_POSES * np.median(np.diff(recording.trajectory.times)))
             pieces = int(np.clip(round(wanted_pieces), 1, MOST_NOISE_PIECES))
-            self.noise_basis = DriftBasis(trajectory.start, trajectory.end, pieces)
+            self.noise_basis = DriftBasis(start, end, pieces)
             # white noise: a piece that is longer than wanted averages more of it
             left = NOISE_LEFT * math.sqrt(min(pieces / wanted_pieces, 1.0)) * np.repeat(taken_off, 3)
             noise_units = np.tile(left, self.noise_basis.size)
@@ -254,7 +259,7 @@ class PoseRefiner(nn.Module):
             "drift": config.refine_drift,
         }
         self.wanted = [part for part in wanted if wanted[part] is True]
-        turns = turns_about_two_axes(trajectory)
+        turns = turns_about_two_axes(recording)
         self.allowed = [
             part
             for part in wanted
@@ -374,21 +379,30 @@ class PoseRefiner(nn.Module):
         return columns
 
     def _lens_slopes(self) -> list[Float64[np.ndarray, "pixels 3"]]:
-        """Derivatives of the directions of pixels with respect to each number of the lens."""
+        """Derivatives of the directions of pixels with respect to each number of the lens.
+
+        Raises:
+            ValueError: The corrected lens has no inverse.
+        """
         now, step = self.corrections, 1e-3
         key = now.focal_scale, now.distortion
         if self._lens is None or self._lens[0] != key:
-            slopes = []
+            lens, slopes = Corrections(focal_scale=now.focal_scale, distortion=now.distortion), []
+            here = self._directions(lens)
             for name in ("focal_scale", "distortion")[: self.parts["lens"].stop - self.parts["lens"].start]:
-                ends = []
-                for sign in (-1, 1):
-                    lens = Corrections(focal_scale=now.focal_scale, distortion=now.distortion)
-                    lens = replace(lens, **{name: getattr(lens, name) + sign * step})
-                    rays = lens.camera(self.recording.camera).pixel_directions().reshape(-1, 3)
-                    ends.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-                slopes.append((ends[1] - ends[0]) / (2.0 * step))
+                ends = {0.0: here}
+                for change in (-step, step):
+                    with suppress(ValueError):  # of a lens that hardly has an inverse, one side is enough
+                        ends[change] = self._directions(replace(lens, **{name: getattr(lens, name) + change}))
+                first, last = min(ends), max(ends)
+                slopes.append((ends[last] - ends[first]) / (last - first))
             self._lens = key, slopes
         return self._lens[1]
+
+    def _directions(self, lens: Corrections) -> Float64[np.ndarray, "pixels 3"]:
+        """Directions of pixels, of length 1; raises ValueError if the lens has no inverse."""
+        rays = lens.camera(self.recording.camera).pixel_directions().reshape(-1, 3)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def solve(self, step: int, may_begin: bool = True) -> bool:
         """Solves the normal equations, and updates the corrections.
@@ -401,7 +415,7 @@ class PoseRefiner(nn.Module):
             Whether a correction changed.
 
         Raises:
-            RecordingError: A correction exceeds `LIMITS`.
+            RecordingError: A correction exceeds `LIMITS`, or the corrected lens has no inverse.
         """
         if step >= SETTLED_AFTER and self._fits_worse():
             return True
@@ -463,8 +477,7 @@ class PoseRefiner(nn.Module):
         """Standard errors of the numbers of a part, corrected or not: milliseconds, milliseconds per second, radians,
         metres, shares. For the drift, they are those of its coefficients."""
         believed = 1.0 / (1.0 + SYSTEMATIC**2 * self._information_a_radian)
-        parts = [other for other in self.parts if other == part or (other in self.corrected and other != "noise")]
-        numbers = self._numbers(parts)
+        numbers = self._numbers([other for other in self.parts if other == part or other in self.corrected])
         some = np.ix_(numbers, numbers)
         variances = np.zeros(len(self.right))
         variances[numbers] = np.linalg.inv(believed * self.normal.numpy()[some] + self._before[some]).diagonal()
@@ -538,11 +551,18 @@ class PoseRefiner(nn.Module):
         for part, where in self.parts.items():
             most, what = LIMITS[part]
             if not bool((self.value[where].abs() <= most).all()):
-                raise RecordingError(
-                    f"{self.recording.path}: to fit the events, {what}, which is not plausible; check poses and "
-                    "calibration with enerf inspect, or train with them as stated (--pipeline.refine-clock False, and "
-                    "so on)."
-                )
+                is_distorted = part == "lens" and bool(self.value[where.start].abs() <= most)
+                raise self._not_plausible(DISTORTED if is_distorted else what)
+        try:
+            self._lens_slopes()
+        except ValueError as error:
+            raise self._not_plausible(DISTORTED) from error
+
+    def _not_plausible(self, what: str) -> RecordingError:
+        return RecordingError(
+            f"{self.recording.path}: to fit the events, {what}, which is not plausible; check poses and calibration "
+            "with enerf inspect, or train with them as stated (--pipeline.refine-clock False, and so on)."
+        )
 
 
 def _distortion_unit(camera: Camera) -> float:
@@ -551,14 +571,15 @@ def _distortion_unit(camera: Camera) -> float:
     return float(np.clip(UNITS["lens"] / square, *DISTORTION_UNITS))
 
 
-def turns_about_two_axes(trajectory: Trajectory) -> bool:
-    """Whether a camera turns far enough for its lens and its mount to be identifiable.
+def turns_about_two_axes(recording: EventRecording) -> bool:
+    """Whether a camera turns far enough, while its recording is used, for its lens and its mount to be identifiable.
 
     If it turns about one axis alone, one direction of the mount's shift is not identifiable (Tsai and Lenz, IEEE
     Transactions on Robotics and Automation 1989). If it does not turn, neither mount nor focal length are: another
     scene explains the same events.
     """
-    rotations = Rotation.from_quat(trajectory.quaternions)
+    poses = recording.trajectory.poses(torch.from_numpy(recording.instants(INSTANTS)))
+    rotations = Rotation.from_matrix(poses[:, :, :3].numpy())
     turns = (rotations.mean().inv() * rotations).as_rotvec()
     second = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1] / math.sqrt(len(turns))
     return bool(second > SMALLEST_TURN)

@@ -15,6 +15,7 @@ from enerf_ns.choices.poses import noise, selection
 from enerf_ns.choices.resolver import resolve
 from enerf_ns.choices.scene import Scene
 from enerf_ns.dataparsers.formats.registry import read_recording
+from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 from enerf_ns.method.config import enerf
 from enerf_ns.simulator.engine import simulate
@@ -48,6 +49,26 @@ def test_noise_of_poses_moves_the_picture_by_what_it_is_at_the_distance_of_the_s
     (row,) = scene.choices
     (pixels,) = re.findall(r"^it moves the picture by ([\d.]+) pixels$", row.why)
     assert row.kept and float(pixels) == pytest.approx(simulated.camera.fx * NOISE / distance, rel=0.1)
+
+
+def test_frames_alone_show_no_correction(recording: Path):
+    config: Any = copy.deepcopy(enerf.config.pipeline)
+    config.datamanager.supervision, config.poses.refine_mount = "frames", True
+    with pytest.raises(FlagError, match=r"--pipeline\.refine-mount True .* frames alone; leave it out, or give"):
+        resolve(config, read_recording(recording))
+
+
+def test_a_focal_length_with_which_the_lens_has_no_inverse_is_refused(recording: Path):
+    """The wider the view, the smaller the distortion with which the corners are seen in a direction."""
+    simulated = read_recording(recording)
+    camera = simulated.camera
+    corner = np.hypot(camera.cx, camera.cy) / camera.fx
+    most = (2.0 / 3.0 / corner) ** 2 / 3.0  # as large a distortion as a corner at this radius can have
+    wide = replace(camera, model="radtan", distortion=(-0.8 * most, 0.0, 0.0, 0.0))
+    config: Any = copy.deepcopy(enerf.config.pipeline)
+    config.poses.focal_scale = 0.8
+    with pytest.raises(FlagError, match=r"--pipeline\.focal-scale 0\.8 gives .* no inverse .*; calibrate again"):
+        resolve(config, replace(simulated, camera=wide))
 
 
 @pytest.mark.parametrize("cutoff", [None, 100.0])

@@ -138,6 +138,49 @@ def test_a_camera_of_their_own_stays_where_it_is_mounted(tmp_path: Path):
     np.testing.assert_allclose(np.linalg.inv(events) @ frames, np.tile(MOUNT, (len(times), 1, 1)), atol=1e-4)
 
 
+@pytest.mark.parametrize("delay", [3.0, -4.0])
+@pytest.mark.parametrize("step", [10, 50])
+def test_the_mount_of_a_camera_is_the_same_at_each_corrected_pose(delay: float, step: int):
+    """Also at both ends, which lie between given poses, where two splines through them differ."""
+    moving = trajectory(step * MILLISECOND)
+    times = np.arange(50, 951, 100) * MILLISECOND
+    frames = Frames(tuple(map(Path, times.astype(str))), times, OTHER, moving.of_mounted(MOUNT))
+    given = EventRecording(Path("made"), "made", CAMERA, moving, lambda: iter(()), (), frames=frames)
+    refined = Corrections(delay).recording(given)
+    assert refined.frames is not None
+    np.testing.assert_array_equal(refined.frames.trajectory.times, refined.trajectory.times)
+    expected = refined.trajectory.of_mounted(MOUNT)
+    np.testing.assert_allclose(refined.frames.trajectory.positions, expected.positions, atol=1e-7)
+    turns = Rotation.from_quat(refined.frames.trajectory.quaternions).inv() * Rotation.from_quat(expected.quaternions)
+    assert turns.magnitude().max() < 1e-7
+
+
+@pytest.mark.parametrize("own_frames", [False, True])
+@pytest.mark.parametrize("frame_delay", [30.0, -30.0])
+def test_frames_keep_their_exposures_when_they_are_corrected_to_beyond_the_poses(own_frames: bool, frame_delay: float):
+    """At each instant of an exposure, the camera is where it is at that time."""
+    moving = trajectory()
+    of_frames = moving.of_mounted(MOUNT) if own_frames else moving
+    times = np.arange(10, 991, 35) * MILLISECOND
+    exposures = np.full(len(times), 18 * MILLISECOND)
+    names = tuple(map(Path, times.astype(str)))
+    frames = Frames(names, times, OTHER if own_frames else CAMERA, of_frames, exposures=exposures)
+    given = EventRecording(Path("made"), "made", CAMERA, moving, lambda: iter(()), (), frames=frames)
+    corrections = Corrections(frame_delay=frame_delay)
+    found = corrections.frames(frames, given)
+    shift = round(frame_delay) * MILLISECOND
+    np.testing.assert_array_equal(found.exposed, frames.exposed - shift)
+    poses = found.trajectory.poses(torch.from_numpy(found.exposed)).numpy()
+    expected = poses_at(of_frames, found.exposed.flatten()).reshape(poses.shape)
+    np.testing.assert_allclose(poses, expected, atol=0.01)  # after 30 ms at 6 m/s
+    inside = of_frames.covers(found.exposed)
+    np.testing.assert_allclose(poses[inside], expected[inside], atol=1e-3)
+    kept = corrections.recording(given).frames
+    assert kept is not None and kept.trajectory is of_frames
+    np.testing.assert_array_equal(kept.times, found.times[of_frames.covers(found.times)])
+    assert len(kept.times) == len(times) - 1
+
+
 def test_nothing_wrong_is_the_recording_itself(tmp_path: Path):
     given = made(tmp_path)
     nothing = Corrections()

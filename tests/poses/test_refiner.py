@@ -301,6 +301,53 @@ def test_a_camera_that_turns_about_one_axis_tells_neither_mount_nor_lens():
     assert refiner.allowed == ["clock", "rate", "drift"]
 
 
+def test_corrections_are_spread_over_the_part_of_a_recording_that_is_used():
+    """Over which alone a camera has to turn, too."""
+    moving, times = trajectory(), np.arange(0, 40 * SPAN + 1, 5_000_000)
+    rows = np.arange(len(times)).clip(0, len(moving.times) - 1)  # after a second, the camera rests
+    rests = Trajectory(times, moving.positions[rows], moving.quaternions[rows])
+    whole = replace(recording(), trajectory=rests, pose_noise_taken_off=(0.002, 0.004))
+    used = PoseRefiner(RefinerConfig(), replace(whole, time_range=(0, 2 * SPAN)))
+    assert used.noise_basis is not None
+    assert [(basis.start, basis.end) for basis in (used.basis, used.noise_basis)] == 2 * [(0, 2 * SPAN)]
+    assert used.basis.num_pieces == 10 and used.noise_basis.num_pieces == 160
+    assert used.units["noise"][0] == pytest.approx(0.6 * 0.002 * math.sqrt(160 / 200))
+    assert "lens" in used.allowed
+    resting = PoseRefiner(RefinerConfig(), replace(whole, time_range=(20 * SPAN, 40 * SPAN)))
+    assert "lens" not in resting.allowed
+
+
+@pytest.mark.parametrize("numbers", [9.0, 4.0])
+def test_a_distortion_is_not_blamed_on_the_focal_length(numbers: float):
+    """Neither one that is too large to be plausible nor one with which no direction is seen at the corners."""
+    refiner = PoseRefiner(RefinerConfig(refine_lens=True), recording())
+    unit = refiner.units["lens"][1]
+    refiner.value[refiner.parts["lens"].stop - 1] = -numbers
+    if numbers < 8.0:
+        with pytest.raises(ValueError, match="no inverse"):
+            Corrections(distortion=-numbers * unit).camera(CAMERA)
+    with pytest.raises(RecordingError, match="made: to fit the events, the lens would have to have a distortion"):
+        refiner._check()
+    refiner.value[refiner.parts["lens"].start] = 9.0
+    with pytest.raises(RecordingError, match="the focal length would have to be corrected by more than 24 %"):
+        refiner._check()
+
+
+def distorted(first: float) -> Camera:
+    return replace(CAMERA, model="radtan", distortion=(first, 0.0, 0.0, 0.0))
+
+
+def test_a_lens_that_hardly_has_an_inverse_has_slopes():
+    """A radius r is seen at r - r^3 / 3 at most, so that the corner, which is seen at 2 / 3, has no larger one."""
+    with pytest.raises(ValueError, match="no inverse"):
+        distorted(-0.3335)
+    refiner = PoseRefiner(RefinerConfig(), replace(recording(), camera=distorted(-0.3325)))
+    _, slope = refiner._lens_slopes()
+    ends = (distorted(first).pixel_directions().reshape(-1, 3) for first in (-0.3325, -0.3315))
+    first, last = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in ends)
+    np.testing.assert_allclose(slope, (last - first) / 1e-3, atol=1e-9)
+
+
 def test_what_no_recording_is_wrong_by_is_an_error():
     refiner = PoseRefiner(RefinerConfig(), recording())
     with pytest.raises(RecordingError, match="clock of the poses would have to be corrected by more than 100 ms"):
@@ -379,7 +426,6 @@ def test_a_training_finds_the_clock(simulated, tmp_path: Path, delay: float, is_
         settings["pipeline.datamanager.event_pairs"] = 256
     run = train(method_config("enerf", folder, tmp_path / "runs", settings))
     refiner = run.pipeline.poses
-    assert refiner is not None
     assert refiner.corrected == (["clock"] if delay else [])
     assert refiner.corrections.delay == pytest.approx(delay, abs=0.3)
     if not delay:  # where nothing is wrong, nothing changes
@@ -399,7 +445,7 @@ def test_a_drift_of_many_pixels_is_corrected(tmp_path: Path):
     made_wrong(tmp_path / "right", tmp_path / "wrong", {"drift": (10.0, 0.5)}, seed=0)
     few = {"max_num_iterations": 900, "evaluation_share": 0.0}
     run = train(method_config("enerf", tmp_path / "wrong", tmp_path / "runs", few))
-    assert run.pipeline.poses is not None and run.pipeline.poses.corrected == ["drift"]
+    assert run.pipeline.poses.corrected == ["drift"]
     true = read_recording(tmp_path / "right").trajectory
     given = read_recording(tmp_path / "wrong").trajectory
     before, after = errors(true, given), errors(true, run.pipeline.datamanager.recording.trajectory)

@@ -117,7 +117,6 @@ def test_poses_are_written_as_training_refined_them(run: Path, recording: Path, 
     """As TUM text, of which NumPy reads the trajectory on the clock of the events; with a lens that OpenCV takes."""
     pipeline = load(run / "config.yml").pipeline
     given = pipeline.datamanager.recording
-    assert pipeline.poses is not None
     pipeline.poses.is_corrected[0], pipeline.poses.value[0] = True, 0.25  # 5 ms
     (checkpoint,) = run.glob("nerfstudio_models/*.ckpt")
     kept = checkpoint.read_bytes()

@@ -247,6 +247,20 @@ def test_poses_that_drift_far_agree_with_no_event(shaken: EventRecording, seed: 
     assert is_in_focus(shaken, 2.0) and not is_in_focus(drifting, 2.0)
 
 
+@pytest.mark.parametrize("milliseconds", [15, 1])
+def test_a_moment_identifies_no_delay(shaken: EventRecording, milliseconds: int):
+    """A quarter of its length is shorter than the delays that are tried."""
+
+    def early(times: np.ndarray) -> np.ndarray:
+        return times * milliseconds // 2000
+
+    (events,), path = shaken.stream_events(), shaken.trajectory
+    events, poses = replace(events, t=early(events.t)), Trajectory(early(path.times), path.positions, path.quaternions)
+    moment = replace(shaken, trajectory=poses, stream_events=lambda: iter([events]))
+    assert is_in_focus(moment, 2.0)
+    assert not agreement(moment).pose_delay.is_identifiable
+
+
 def test_few_events_say_nothing(tmp_path: Path):
     from recordings import write_esim
 

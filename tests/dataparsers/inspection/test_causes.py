@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import faults
@@ -114,6 +115,13 @@ def test_no_right_recording_of_the_benchmarks_has_a_cause(name: str, tmp_path: P
 def test_a_depth_range_without_the_scene_is_named(shaken: EventRecording):
     found = why_not_explained(shaken, (10.0, 40.0), shaken)
     assert found is not None and "depth range is 10 m to 40 m, but the parallax" in found
+    assert "leave out --depth-range" in found
+
+
+def test_a_depth_range_of_the_recording_is_not_to_be_left_out_of_the_command(shaken: EventRecording):
+    wrong = 10.0, 40.0
+    found = why_not_explained(replace(shaken, depth_range=wrong), wrong, shaken)
+    assert found is not None and "give --depth-range" in found and "leave out" not in found
 
 
 def test_a_camera_that_only_turns_has_no_cause():

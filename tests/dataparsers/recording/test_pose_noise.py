@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
+from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.pose_noise import pose_noise, smoothing_spline
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
+CAMERA = Camera(24, 18, 20.0, 20.0, 12.0, 9.0)
 
-def moving(noise: float, degrees: float, poses: int = 400) -> tuple[Trajectory, np.ndarray, Rotation]:
+
+def moving(noise: float, degrees: float, poses: int = 400, seed: int = 0) -> tuple[Trajectory, np.ndarray, Rotation]:
     """A camera that shakes at 3 Hz for two seconds, 200 poses a second; its poses with noise, and without."""
-    random, seconds = np.random.default_rng(0), np.arange(poses) / 200.0
+    random, seconds = np.random.default_rng(seed), np.arange(poses) / 200.0
     phase = 6.0 * np.pi * seconds
     positions = 0.05 * np.stack([np.sin(phase), np.cos(phase), np.sin(0.5 * phase)], axis=1)
     turns = Rotation.from_rotvec(0.1 * np.stack([np.cos(phase), np.sin(0.7 * phase), 20.0 * seconds], axis=1))
@@ -33,6 +39,12 @@ def test_noise_is_told_and_halved():
     off = (turns.inv() * Rotation.from_quat(smooth.quaternions)).as_rotvec()
     assert np.degrees(np.sqrt((off**2).mean())) < 0.05
     assert noise.pixels(500.0, 2.0) == pytest.approx(500 * np.hypot(noise.position / 2, noise.rotation))
+
+
+def test_noise_of_rotations_is_estimated_as_well_as_that_of_positions():
+    found = [pose_noise(moving(1e-3, 0.1, seed=seed)[0]) for seed in range(8)]
+    shares = [(one.position / 1e-3, np.degrees(one.rotation) / 0.1) for one in found if one is not None]
+    np.testing.assert_allclose(np.mean(shares, axis=0), 0.95, atol=0.05)
 
 
 def test_what_is_smooth_stays():
@@ -65,6 +77,21 @@ def test_a_mounted_camera_stays_mounted():
     assert noise is not None and noise.smooth.body is not None
     again = noise.smooth.body[0].of_mounted(mount)
     np.testing.assert_allclose(again.positions, noise.smooth.positions, atol=1e-9)
+
+
+def test_a_camera_of_the_frames_stays_where_it_is_mounted():
+    """On the camera of the events, whose poses are smoothed."""
+    given, _, _ = moving(1e-3, 0.1)
+    mount = np.eye(4)
+    mount[:3] = np.column_stack([Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), [0.05, -0.02, 0.01]])
+    frames = Frames((Path("0.png"),), given.times[5:6], CAMERA, given.of_mounted(mount))
+    recording = EventRecording(Path("memory"), "test", CAMERA, given, lambda: iter(()), (), frames=frames)
+    smooth = recording.selected(None, False, smooth_poses=True)
+    assert smooth.frames is not None and not np.array_equal(smooth.trajectory.positions, given.positions)
+    expected, found = smooth.trajectory.of_mounted(mount), smooth.frames.trajectory
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-12)
+    off = Rotation.from_quat(found.quaternions).inv() * Rotation.from_quat(expected.quaternions)
+    assert off.magnitude().max() < 1e-9
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
