@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Optional, Tuple, Type  # noqa: UP035
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -30,11 +30,11 @@ from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.registry import formats, read_recording
 from enerf_ns.dataparsers.index.picture_files import write_pictures
 from enerf_ns.dataparsers.inspection.causes import depth_range_or_cause
-from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted
+from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, exit_with_a_sentence, quoted, shortened
 from enerf_ns.dataparsers.recording.ffmpeg import make_ffmpeg_available
 from enerf_ns.dataparsers.recording.files import write_whole
-from enerf_ns.dataparsers.recording.ranges import check_reading
-from enerf_ns.dataparsers.recording.recording import EventRecording, Frames
+from enerf_ns.dataparsers.recording.ranges import check_reading, shown
+from enerf_ns.dataparsers.recording.recording import EventRecording, Frames, seconds
 from enerf_ns.dataparsers.recording.safe_globals import allow_numpy_scalars_in_checkpoints
 from enerf_ns.dataparsers.scene.scene_box import scene_normalisation
 
@@ -136,7 +136,10 @@ class EventDataParser(DataParser):
                     f"reconstruct {quoted(recording.path)} --output-dir NEW and give that folder."
                 )
             go_on_without_lpips()
-            return with_picture_files(self.outputs(recording, split))
+            outputs = self.outputs(recording, split)
+            if split == "train":
+                check_trained_frames(recording, self.config, outputs.metadata["frames"])
+            return with_picture_files(outputs)
 
     def outputs(self, recording: EventRecording, split: str) -> DataparserOutputs:
         """Nerfstudio's outputs for one split: its cameras, the scene box, and the recording's file names.
@@ -150,7 +153,8 @@ class EventDataParser(DataParser):
 
         Raises:
             RecordingError: The depth range is neither stated nor measurable, or all frames lie in gaps of the poses.
-            FlagError: The frames cannot be downscaled by this factor.
+            FlagError: The frames cannot be downscaled by this factor, or stated numbers choose no frame or leave none
+                to hold out.
         """
         near, far = depth_range_or_cause(recording, self.config.depth_range)
         limits = self.config.box, self.config.contraction_depth
@@ -254,7 +258,8 @@ def with_picture_files(outputs: DataparserOutputs) -> DataparserOutputs:
 def split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
     """The frames of one split, or instants along the trajectory if the recording has no frames.
 
-    The held-out frames do not depend on the frames to train on, so that all methods are scored on the same frames.
+    The held-out frames do not depend on whether sharp or blurred frames are for training, so that all methods are
+    scored on the same frames. Only numbers that are stated for both splits may be in both.
 
     Returns:
         The frames, without those in gaps of the poses. Frames to train on are also without those whose exposures reach
@@ -262,7 +267,8 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
 
     Raises:
         RecordingError: No frame is left.
-        FlagError: The exposure or the downscaling is impossible for the frames.
+        FlagError: The exposure or the downscaling is impossible for the frames, or stated numbers choose no frame or
+            leave none to hold out.
     """
     frames, are_frames = _split_frames(recording, config, held_out)
     if config.downscale_factor is None:
@@ -276,7 +282,10 @@ def split_frames(recording: EventRecording, config: EventDataParserConfig, held_
 
 
 def _split_frames(recording: EventRecording, config: EventDataParserConfig, held_out: bool) -> tuple[Frames, bool]:
-    if held_out and recording.held_out_frames:
+    stated, others = config.train_frame_indices, config.held_out_frame_indices
+    if held_out:
+        stated, others = others, stated
+    if held_out and recording.held_out_frames and stated is None:
         return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     train_frames = config.train_frames or ("blurred" if recording.reconstructed_by else "sharp")
@@ -296,24 +305,17 @@ def _split_frames(recording: EventRecording, config: EventDataParserConfig, held
             "frames with --keep-pose-gaps True."
         )
     frames = frames.subset(np.flatnonzero(posed))
-    start, end = recording.span
-    used = (frames.times >= start) & (frames.times <= end)
-    if not used.any():
-        used[:] = True
-    if config.held_out_frame_indices is not None:
-        evaluated = np.isin(frames.numbers, config.held_out_frame_indices)
-    elif recording.held_out_frames:
-        evaluated = np.zeros_like(used)
+    if stated is None:
+        chosen = _not_stated(recording, config, held_out, frames, others)
     else:
-        every = DEFAULT_HELD_OUT_EVERY if config.held_out_every is None else config.held_out_every
-        evaluated = used & ((np.cumsum(used) - 1) % every == every // 2)
-    if held_out:
-        chosen = evaluated
-    elif config.train_frame_indices is not None:
-        chosen = np.isin(frames.numbers, config.train_frame_indices)
-    else:
-        chosen = used & ~evaluated
-    frames = frames.subset(np.flatnonzero(chosen if chosen.any() else used))
+        chosen = np.isin(frames.numbers, stated)
+        if not chosen.any():
+            raise FlagError(
+                f"event-data --{'held-out' if held_out else 'train'}-frame-indices {shortened(shown(stated))} chooses "
+                f"none of the frames of {recording.path} with poses, which have numbers from {frames.numbers[0]} to "
+                f"{frames.numbers[-1]}; give some of these."
+            )
+    frames = frames.subset(np.flatnonzero(chosen))
     if held_out or not recording.has_frames:
         return frames, recording.has_frames
     known = recording.knows_poses(frames)
@@ -323,6 +325,73 @@ def _split_frames(recording: EventRecording, config: EventDataParserConfig, held
             "add the poses that are missing, or take the frames as instants with --exposure-ms 0."
         )
     return frames.subset(np.flatnonzero(known)), True
+
+
+def _not_stated(
+    recording: EventRecording,
+    config: EventDataParserConfig,
+    held_out: bool,
+    frames: Frames,
+    others: Sequence[int] | None,
+) -> Bool[np.ndarray, " frames"]:
+    """Returns which frames a split has whose numbers are not stated.
+
+    Args:
+        recording, config, held_out: As in `split_frames`.
+        frames: The frames outside of gaps.
+        others: Numbers that are stated for the other split.
+
+    Raises:
+        FlagError: All frames are stated to be for training.
+    """
+    used = _in_time_range(recording, frames)
+    if not used.any():
+        used[:] = True
+    left = used & ~np.isin(frames.numbers, others or ())
+    if held_out and not left.any():
+        raise FlagError(
+            f"event-data --train-frame-indices takes all frames of {recording.path}, so that none is held out; leave "
+            "some out, or state those of --held-out-frame-indices as well."
+        )
+    if not held_out and (others is not None or recording.held_out_frames):
+        chosen = left
+    else:
+        every = DEFAULT_HELD_OUT_EVERY if config.held_out_every is None else config.held_out_every
+        evaluated = used & ((np.cumsum(used) - 1) % every == every // 2)
+        chosen = left & (evaluated == held_out)
+    if chosen.any():
+        return chosen
+    return left if held_out else used
+
+
+def _in_time_range(recording: EventRecording, frames: Frames) -> Bool[np.ndarray, " frames"]:
+    start, end = recording.span
+    return (frames.times >= start) & (frames.times <= end)
+
+
+def check_trained_frames(recording: EventRecording, config: EventDataParserConfig, frames: Frames) -> None:
+    """Checks that frames of the train split may be trained on. Where events alone are, they only place cameras.
+
+    Args:
+        recording, config: Arguments of `split_frames`.
+        frames: Its result.
+
+    Raises:
+        FlagError: The time range holds none of the frames, or all of them are stated to be held out.
+    """
+    if config.train_frame_indices is not None:
+        return
+    if not _in_time_range(recording, frames).any():
+        first, last = seconds(frames.times[0]), seconds(frames.times[-1])
+        raise FlagError(
+            f"event-data --time-range holds none of the frames of {recording.path} to train on, which lie from {first} "
+            f"to {last}; give a range that holds some."
+        )
+    if np.isin(frames.numbers, config.held_out_frame_indices or ()).all():
+        raise FlagError(
+            f"event-data --held-out-frame-indices takes all frames of {recording.path}, so that none is left to train "
+            "on; leave some out, or state those of --train-frame-indices as well."
+        )
 
 
 def event_pictures(recording: EventRecording) -> Frames:

@@ -9,10 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.json_values import open_json
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames
 from enerf_ns.dataparsers.formats.registry import check_outside_recordings, read_recording
 from enerf_ns.dataparsers.formats.writer import camera_json, encode_json
 from enerf_ns.dataparsers.recording.errors import OutputError, RecordingError
@@ -69,6 +71,8 @@ def write_recording(recording: EventRecording, folder: Path) -> list[str]:
     if recording.held_out_frames is not None:
         views = len(recording.held_out_frames.times)
         sentences.insert(0, f"{views:,} held-out views are left out, since they lie on a trajectory of their own.")
+    if recording.zero:
+        sentences.insert(0, f"Time 0 of the new recording is {recording.zero} ns on the clock of the files.")
     if recording.depth_maps is not None:
         maps = len(recording.depth_maps.times)
         sentences.insert(0, f"{maps:,} depth maps are left out, since the layout holds those at the times of frames.")
@@ -108,8 +112,8 @@ def convert_event_file(
         file = open_event_file(source)
         about = _camera_json(file, camera)
         write_whole(folder / "recording.json", encode_json({"camera": about}))
-        frame_times = _write_frames(file, folder / "frames", about["width"], about["height"], sentences)
-        rows = poses.rows(frame_times, sentences) if poses is not None else None
+        frames = _write_frames(file, folder / "frames", about["width"], about["height"], sentences)
+        rows = poses.rows([frames], sentences) if poses is not None else None
         if rows is not None:
             event_recording.write_poses(folder / "poses.txt", rows[0] - file.start, *rows[1:])
         num_events, _, last = event_recording.write_events(
@@ -141,17 +145,18 @@ def convert_event_file(
     return sentences
 
 
-def _write_frames(file: EventFile, folder: Path, width: int, height: int, sentences: list[str]) -> dict[str, int]:
+def _write_frames(file: EventFile, folder: Path, width: int, height: int, sentences: list[str]) -> NamedFrames:
     """Writes the frames of a file, with the table of their times, and adds a sentence on those that are left out.
 
     Returns:
-        The time (ns on the clock of the file) of each frame by the name of its picture.
+        Their pictures, with times on the clock of the file.
 
     Raises:
         RecordingError: The file is damaged, or a frame goes back in time.
         OSError: The disk is full.
     """
-    times: dict[str, int] = {}
+    pictures: list[Path] = []
+    times: list[int] = []
     exposures: list[int] = []
     num_others, last = 0, None
     for frame in file.frames() if file.frames is not None else ():
@@ -164,13 +169,14 @@ def _write_frames(file: EventFile, folder: Path, width: int, height: int, senten
                 f"{file.path} holds a frame at {middle} ns after one at {last} ns, but frames must be in time order; "
                 "record it again."
             )
-        last, name = middle, f"{len(times):05d}.png"
+        last = middle
         folder.mkdir(exist_ok=True)
-        (folder / name).write_bytes(encode_png(frame.pixels))
-        times[name] = middle
+        pictures.append(folder / f"{len(pictures):05d}.png")
+        pictures[-1].write_bytes(encode_png(frame.pixels))
+        times.append(middle)
         exposures.append(frame.end - frame.begin)
     if times:
-        stamps = [time - file.start for time in times.values()]
+        stamps = [time - file.start for time in times]
         (folder / event_recording.STAMPS_NAME).write_text("".join(f"{stamp}\n" for stamp in stamps))
         sentences.append(f"{len(times):,} frames are written.")
     if any(exposures):
@@ -178,7 +184,7 @@ def _write_frames(file: EventFile, folder: Path, width: int, height: int, senten
     if num_others:
         total, sensor = num_others + len(times), f"sensor's {width} x {height} pixels"
         sentences.append(f"{num_others:,} of {total:,} frames are left out, since they are not of the {sensor}.")
-    return times
+    return NamedFrames(pictures, np.array(times, np.int64))
 
 
 def _camera_json(file: EventFile, path: Path | None) -> dict[str, Any]:
@@ -209,9 +215,18 @@ def _check_is_free(output_dir: Path) -> None:
 
 @contextmanager
 def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
-    """Yields a temporary folder, which becomes the output at the end of the block if no error occurs."""
+    """Yields a temporary folder, which becomes the output at the end of the block if no error occurs.
+
+    Raises:
+        OutputError: The output holds something, lies in the source, is a mount point, or cannot be written.
+    """
     output_dir = output_dir.resolve() if output_dir.is_symlink() else output_dir
     check_outside_recordings("--output-dir", output_dir, source)
+    if output_dir.is_mount():
+        raise OutputError(
+            f"{output_dir} is a mount point, which no new folder can replace; give a folder in it as --output-dir, "
+            f"such as {output_dir / 'recording'}."
+        )
     _check_is_free(output_dir)
     partial = partial_of(output_dir)
     try:
@@ -223,7 +238,7 @@ def new_folder(source: Path, output_dir: Path) -> Iterator[Path]:
         partial.rename(output_dir)
     except OSError as error:
         refused = partial if error.filename is None else Path(os.fsdecode(error.filename))
-        if not (refused.is_relative_to(partial) or partial.is_relative_to(refused)):
+        if not (refused.is_relative_to(partial) or partial.is_relative_to(refused) or refused == output_dir):
             raise  # what is read
         raise OutputError(
             f"{output_dir} could not be written ({error.strerror}), and nothing was left there; make room, or give "

@@ -21,7 +21,7 @@ from jaxtyping import Shaped
 
 from enerf_ns.dataparsers.compiled import compiled
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames, poses_of
 from enerf_ns.dataparsers.formats.text_tables import parse_numbers, parse_times, read_rows
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
@@ -60,9 +60,9 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     notes: list[str] = []
     events_file = folder / "events.txt"
     frame_files, frame_times = _read_frame_list(folder, notes)
-    stamps = {file.name: time for file, time in zip(frame_files, frame_times.tolist(), strict=True)}
+    named = [NamedFrames(frame_files, frame_times)]
     poses_file, unit = (folder / "groundtruth.txt", "s") if poses is None else (poses.path, poses.unit)
-    pose_times, positions, quaternions = poses_of(poses_file, unit, poses, stamps, notes)
+    pose_times, positions, quaternions = poses_of(poses_file, unit, poses, named, notes)
     first_stamps = [_first_event_time(events_file), pose_times[0], *frame_times[:1]]
     zero = int(min(first_stamps))
     num_bytes = events_file.stat().st_size
@@ -82,6 +82,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
         trajectory=trajectory,
         stream_events=lambda: _stream_events(events_file, num_bytes, zero),
         event_files=(events_file,),
+        zero=zero,
         frames=Frames(frame_files, frame_times - zero, camera, trajectory) if frame_files else None,
         notes=tuple(notes),
         locate_event=lambda index: f"{events_file}, line {index + 1}",

@@ -37,7 +37,7 @@ from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.frame_folders import check_one_each, images_in, read_stamps
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events, read_rectified_camera
 from enerf_ns.dataparsers.formats.json_values import Value
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, poses_of
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames, poses_of
 from enerf_ns.dataparsers.formats.text_tables import parse_times, read_rows
 from enerf_ns.dataparsers.formats.yaml_values import read_yaml
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
@@ -96,9 +96,9 @@ def read(
     if rectify_map.exists():
         _check_map(rectify_map, calibration, side, camera)
     files, frame_times, exposures, stamps_file = _read_frames(folder, side)
-    stamps = {file.name: time for file, time in zip(files, frame_times.tolist(), strict=True)}
+    named = [NamedFrames(files, frame_times, left_from_frame)]
     poses_file, unit = (folder / "poses.txt", "s") if poses is None else (poses.path, poses.unit)
-    rows = poses_of(poses_file, unit, poses, stamps, notes)
+    rows = poses_of(poses_file, unit, poses, named, notes)
     zero = int(min(events.first_time, rows[0][0], *frame_times[:1]))
     left = Trajectory(rows[0] - zero, *rows[1:])
     trajectory = left if side == "left" else left.of_mounted(left_from_event)
@@ -115,6 +115,7 @@ def read(
         trajectory=trajectory,
         stream_events=lambda: events.stream(zero),
         event_files=(events.path,),
+        zero=zero,
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,

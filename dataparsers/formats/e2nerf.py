@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.event_files import EventFile, open_event_file
 from enerf_ns.dataparsers.formats.format import Format
 from enerf_ns.dataparsers.formats.frame_folders import images_in
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames
 from enerf_ns.dataparsers.recording.camera import Camera, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError
 from enerf_ns.dataparsers.recording.files import check_image_sizes, files_in, load_array, of_file
@@ -92,8 +92,8 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             "The poses are from COLMAP, so that a unit of length is no metre, and the lens distortion is not known."
         )
     else:
-        stamps = dict(zip((image.name for image in files), middles.tolist(), strict=True)) if files else {}
-        poses_file, unit, pose_rows = poses.path, poses.unit, poses.rows(stamps, notes)
+        named = [NamedFrames(files, middles)] if files else []
+        poses_file, unit, pose_rows = poses.path, poses.unit, poses.rows(named, notes)
     zero = int(min(file.start, pose_rows[0][0], exposures[0, 0]))
     trajectory = Trajectory(pose_rows[0] - zero, *pose_rows[1:])
     near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
@@ -108,6 +108,7 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _shifted(file, file.start - zero),
             event_files=(file.path,),
+            zero=zero,
             blurred_frames=frames,
             depth_range=(near, far) if 0 < near < far < np.inf else None,
             notes=tuple(notes),

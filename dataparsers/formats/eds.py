@@ -141,6 +141,7 @@ def read(folder: Path) -> EventRecording:
         trajectory=trajectory,
         stream_events=lambda: events.stream(zero),
         event_files=(events.path,),
+        zero=zero,
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,

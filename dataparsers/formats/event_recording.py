@@ -9,6 +9,8 @@
     frames/*.png                     sharp frames (or .jpg), with frames/stamps_ns.txt, one stamp a line: the middle of
                                      each exposure; and frames/exposures_ns.txt, how long each was, 0 for an instant
                                      (both optional)
+    frames/numbers.txt               the numbers by which flags choose frames, one a line, if they are not 0, 1, 2 and
+                                     so on (optional)
     blurred_frames/*.png             frames blurred by motion, with the same tables (optional); if reconstructed_by
                                      states that they were made from the events, their camera is the event camera
     depth/*.npy                      (height, width) depth in metres of each sharp frame, 0 where nothing is (optional)
@@ -34,9 +36,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from enerf_ns.dataparsers.formats.columns import LATEST, STORED_TYPES, check_columns, check_times
 from enerf_ns.dataparsers.formats.format import Format
-from enerf_ns.dataparsers.formats.frame_folders import read_frames, read_stamps
+from enerf_ns.dataparsers.formats.frame_folders import check_one_each, read_frames, read_stamps
 from enerf_ns.dataparsers.formats.json_values import Value, open_json
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, RestPoses, poses_of
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames, RestPoses, poses_of
+from enerf_ns.dataparsers.formats.text_tables import parse_numbers, read_rows
 from enerf_ns.dataparsers.formats.writer import (
     CAMERA_KEYS,
     MOUNTING_KEY,
@@ -55,6 +58,7 @@ from enerf_ns.dataparsers.recording.camera import COEFFICIENTS, Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_is_folder, files_in, is_deep, load_array, of_file, write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of, is_deep_picture, load_depth_map, load_picture
+from enerf_ns.dataparsers.recording.ranges import COUNT
 from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, LARGEST_GAMMA, EventRecording, Events, Frames
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
@@ -64,7 +68,7 @@ OPTIONAL_KEYS = (
     *("frame_camera", "contrast_thresholds", "refractory_period_ns", "bayer_pattern", "response", "depth_range"),
     *("reconstructed_by", "white_level", "frame_gamma"),
 )
-STAMPS_NAME, EXPOSURES_NAME = "stamps_ns.txt", "exposures_ns.txt"
+STAMPS_NAME, EXPOSURES_NAME, NUMBERS_NAME = "stamps_ns.txt", "exposures_ns.txt", "numbers.txt"
 
 MOUNTING_TOLERANCE = 1e-6
 """Largest motion of the frame camera in the axes of the event camera: metres, and entries of the rotation."""
@@ -87,12 +91,14 @@ def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:
     about.check_keys(("camera",), OPTIONAL_KEYS)
     camera = parse_camera(about["camera"], folder / "camera_directions.npy")
     poses_file, unit = (folder / "poses.txt", "ns") if poses is None else (poses.path, poses.unit)
-    trajectory = Trajectory(*poses_of(poses_file, unit, poses, _frame_times(folder) if poses else {}, notes))
-    frame_camera, frame_trajectory = camera, trajectory
-    if (mounted := about.get("frame_camera")) is not None:
-        frame_camera, mounting = _parse_frame_camera(mounted)
-        frame_trajectory = trajectory.of_mounted(mounting)
-    reconstructed_by = about.found.get("reconstructed_by")
+    mounted, reconstructed_by = about.get("frame_camera"), about.found.get("reconstructed_by")
+    frame_camera, mounting = (camera, np.eye(4)) if mounted is None else _parse_frame_camera(mounted)
+    named = []
+    if poses is not None:
+        blurred_mounting = mounting if reconstructed_by is None else np.eye(4)
+        named = [*_named(folder / "frames", mounting), *_named(folder / "blurred_frames", blurred_mounting)]
+    trajectory = Trajectory(*poses_of(poses_file, unit, poses, named, notes))
+    frame_trajectory = trajectory if mounted is None else trajectory.of_mounted(mounting)
     blurred_rig = frame_camera, frame_trajectory
     if reconstructed_by is not None:
         blurred_rig = camera, trajectory
@@ -161,7 +167,7 @@ def write(recording: EventRecording, folder: Path) -> int:
 
     Raises:
         RecordingError: An event lies outside the sensor, goes back in time or has another polarity, times are in
-            another unit, or the camera of the frames is not fixed to the event camera.
+            another unit, no event lies within the poses, or the camera of the frames is not fixed to the event camera.
         OSError: The disk is full, or a frame cannot be copied.
     """
     kinds = {"frames": recording.frames, "blurred_frames": recording.blurred_frames}
@@ -194,6 +200,9 @@ def write(recording: EventRecording, folder: Path) -> int:
     )
     if recording.has_poses:
         recording.check_units(num_events, last - first)
+        start, end = recording.span
+        if last < start or end < first:
+            raise recording.not_covered(first, last)
     return num_events
 
 
@@ -410,7 +419,26 @@ def _read_frames(
     files = _images_in(folder)
     rig = files, stamps_file, camera, trajectory
     frames = read_frames(*rig, depth_files, exposures_file, poses_file=poses_file)
-    return frames and replace(frames, stated_white=white if is_deep(files[0]) else None, gamma=gamma)
+    if frames is None:
+        return None
+    numbers = frames.numbers
+    if (folder / NUMBERS_NAME).exists():
+        numbers = _read_numbers(folder / NUMBERS_NAME, len(files))
+    return replace(frames, stated_white=white if is_deep(files[0]) else None, gamma=gamma, numbers=numbers)
+
+
+def _read_numbers(path: Path, num_frames: int) -> Int64[np.ndarray, " frames"]:
+    rows, lines = read_rows(path, "number")
+    check_one_each(path.parent, num_frames, path, len(rows), "numbers")
+    values = parse_numbers(path, rows, lines)[:, 0]
+    wrong = (values != np.rint(values)) | (np.diff(values, prepend=-1) <= 0) | (values > COUNT[1])
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise RecordingError(
+            f"{path}, line {lines[first]} holds {rows[first][0]}, but whole numbers from 0 to {COUNT[1]:,} were "
+            "expected, each above the one before."
+        )
+    return values.astype(np.int64)
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -418,15 +446,12 @@ def _images_in(folder: Path) -> list[Path]:
     return [file for file in files_in(folder, "*") if file.suffix.lower() in kinds]
 
 
-def _frame_times(folder: Path) -> dict[str, int]:
-    """Returns the time (ns) of each frame by the name of its file."""
-    times: dict[str, int] = {}
-    for frames in (folder / "blurred_frames", folder / "frames"):
-        if (frames / STAMPS_NAME).exists():
-            files = _images_in(frames)
-            stamps = read_stamps(files, frames / STAMPS_NAME, "ns", frames).tolist()
-            times.update(zip((file.name for file in files), stamps, strict=True))
-    return times
+def _named(folder: Path, mounting: Float64[np.ndarray, "4 4"]) -> list[NamedFrames]:
+    """Returns the frames of a folder, if it has some."""
+    if not (folder / STAMPS_NAME).exists():
+        return []
+    files = _images_in(folder)
+    return [NamedFrames(files, read_stamps(files, folder / STAMPS_NAME, "ns", folder), mounting)]
 
 
 def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
@@ -441,6 +466,8 @@ def _write_frames(frames: Frames, folder: Path, depth_folder: Path) -> None:
         else:
             Image.fromarray(picture[..., 0]).save(folder / f"{name}.png")
     (folder / "stamps_ns.txt").write_text("".join(f"{time}\n" for time in frames.times.tolist()))
+    if (frames.numbers != np.arange(len(frames.numbers))).any():
+        (folder / NUMBERS_NAME).write_text("".join(f"{number}\n" for number in frames.numbers.tolist()))
     if frames.exposures is not None:
         (folder / EXPOSURES_NAME).write_text("".join(f"{exposure}\n" for exposure in frames.exposures.tolist()))
     if frames.depth_filenames and folder.name == "frames":

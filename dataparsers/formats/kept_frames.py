@@ -23,7 +23,7 @@ STAMPS = "stamps_ns.npy"
 def keep_frames(
     source: Path, name: str, frames: Callable[[], Iterator[tuple[int, Shaped[np.ndarray, "height width channels"]]]]
 ) -> tuple[tuple[Path, ...], Int64[np.ndarray, " frames"]]:
-    """Returns the files (PNG) and stamps of frames, which are written to the cache unless they are there.
+    """Returns the files (PNG) and stamps of frames, which are written to the cache unless all of them are there.
 
     The name of their folder is a hash of the source, its size and its time of modification.
 
@@ -41,7 +41,9 @@ def keep_frames(
     made_from = repr((LAYOUT, str(source.resolve()), state.st_size, state.st_mtime_ns, name))
     try:
         folder = cache_entry(f"frames-{hashlib.sha256(made_from.encode()).hexdigest()[:32]}")
-        if not (folder / STAMPS).exists():
+        if folder.exists() and not _is_whole(folder):
+            shutil.rmtree(folder)
+        if not folder.exists():
             _write(folder, source, name, frames())
     except OSError as error:
         raise OutputError(
@@ -74,6 +76,12 @@ def _write(folder: Path, source: Path, name: str, frames: Iterator[tuple[int, np
                 raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _is_whole(folder: Path) -> bool:
+    """Returns whether no file is missing, as after a program that removes old files."""
+    files = {file.name for file in folder.iterdir()}
+    return STAMPS in files and all(_file_name(i) in files for i in range(len(load_array(folder / STAMPS))))
 
 
 def _file_name(number: int) -> str:

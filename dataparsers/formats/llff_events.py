@@ -140,6 +140,7 @@ def read(folder: Path, pose_set: str | None = None) -> EventRecording:
             trajectory=trajectory,
             stream_events=lambda: _stream_events(events, zero, find),
             event_files=(events_file,),
+            zero=zero,
             blurred_frames=blurred,
             held_out_frames=_held_out(images, poses, is_sharp, frame_camera, notes),
             bayer_pattern=pattern,

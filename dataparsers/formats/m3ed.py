@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from enerf_ns.dataparsers.formats.columns import check_times
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.hdf5_events import Hdf5Events
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseRows
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames, PoseRows
 from enerf_ns.dataparsers.recording.camera import Camera, CameraModel, check_rotation
 from enerf_ns.dataparsers.recording.errors import RecordingError, shortened
 from enerf_ns.dataparsers.recording.files import files_in, of_file, reading
@@ -91,18 +91,18 @@ def read(
         if member_at(path, file, FRAMES) is not None:
             frame_rig = _read_camera(path, file, "ovc/left/calib")
     frame_times = np.zeros(0, np.int64) if frame_rig is None else _read_frame_times(path, frame_rig[0])
+    mounting = np.eye(4) if frame_rig is None else np.linalg.inv(left_from_camera) @ frame_rig[1]
     if poses is None:
         poses_file, unit = _find_poses(folder), "us"
         rows = _read_poses(poses_file, path, left_from_camera)
     else:
         poses_file, unit = poses.path, poses.unit
-        stamps = {f"{number:05d}.png": time for number, time in enumerate(frame_times.tolist())}
-        rows = poses.rows(stamps, notes)
+        names = [Path(f"{number:05d}.png") for number in range(len(frame_times))]
+        rows = poses.rows([NamedFrames(names, frame_times, mounting)], notes)
     trajectory = Trajectory(*rows)
     frames = None
     if frame_rig is not None and len(frame_times):
         files = tuple(path / FRAMES / str(number) for number in range(len(frame_times)))
-        mounting = np.linalg.inv(left_from_camera) @ frame_rig[1]
         frames = Frames(files, frame_times, frame_rig[0], trajectory.of_mounted(mounting))
     return EventRecording(
         path=folder,
@@ -201,8 +201,6 @@ def _read_poses(path: Path, data: Path, left_from_camera: Float64[np.ndarray, "4
         raise RecordingError(
             f"{path} holds {len(to_camera):,} poses and {len(stamps):,} times, but as many, at least 2, were expected."
         )
-    if stamps.dtype.kind == "f":
-        raise RecordingError(f"{path} holds ts as {stamps.dtype}, but whole microseconds were expected.")
     times = _microseconds(path, "ts", stamps)
     _check_poses(path, "Cn_T_C0", to_camera)
     if indices is not None:

@@ -120,6 +120,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         trajectory=trajectory,
         stream_events=lambda: _stream_events(data, group, num_events, zero),
         event_files=(data,),
+        zero=zero,
         frames=_frames(frames, zero, camera, trajectory),
         depth_maps=depth_maps,
         notes=tuple(notes),

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
 from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -82,6 +82,17 @@ class PoseFlags:
 
 
 @dataclass(frozen=True)
+class NamedFrames:
+    """Frames of a recording, which poses of images may name."""
+
+    files: Sequence[Path]
+    times: Int64[np.ndarray, " frames"]
+    """Times in nanoseconds."""
+    mounting: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Pose of their camera in the axes of the camera whose poses are read, metres."""
+
+
+@dataclass(frozen=True)
 class GivenPoses:
     """A file of poses that the user gives for a recording."""
 
@@ -93,16 +104,17 @@ class GivenPoses:
         """Unit of the times, s, ms, us or ns."""
         return self.flags.poses_unit or _format_of(self.path).unit
 
-    def rows(self, frame_times: Mapping[str, int], notes: list[str]) -> PoseRows:
+    def rows(self, frames: Sequence[NamedFrames], notes: list[str]) -> PoseRows:
         """Returns the poses of the event camera on the clock of the file: camera to world, OpenCV axes, metres.
 
         Args:
-            frame_times: Time (ns) of each frame of the recording, by the name of its file.
-            notes: Gets sentences on what was left out or renormalised.
+            frames: The frames of the recording.
+            notes: Gets sentences on what was left out or renormalised, and on frames of a second camera.
 
         Raises:
             RecordingError: A file is missing, damaged, or holds fewer than two poses.
-            FlagError: A flag changes nothing for this format, or is out of range.
+            FlagError: A flag changes nothing for this format, is out of range, or is missing for frames that share a
+                name.
         """
         flags, format = self.flags, _format_of(self.path)
         self._check_flags(format)
@@ -119,14 +131,22 @@ class GivenPoses:
         turns = turns * Rotation.from_matrix(FROM_OPENCV[flags.poses_axes or format.axes])
         quaternions = turns.as_quat()
         if not isinstance(keys, np.ndarray):
-            keys, chosen = self._times_of(keys, frame_times, notes)
+            keys, chosen, mountings = self._times_of(keys, frames, notes)
             positions, quaternions = positions[chosen], quaternions[chosen]
+            if flags.hand_eye is None and (mountings != np.eye(4)).any():
+                notes.append(
+                    f"The poses in {self.path.name} are of frames of a second camera, and those of the event camera "
+                    "follow from its mounting in metres, as which --poses-scale must make them."
+                )
+                mounts, turns = np.linalg.inv(mountings), Rotation.from_quat(quaternions)
+                positions = positions + turns.apply(mounts[:, :3, 3])
+                quaternions = (turns * Rotation.from_matrix(mounts[:, :3, :3])).as_quat()
         return keys - nanoseconds(flags.poses_delay_ms * 1e-3), positions, quaternions
 
     def _check_flags(self, format: PoseFormat) -> None:
-        for field in fields(PoseFlags):
-            if field.name in format.without and getattr(self.flags, field.name) != field.default:
-                flag = f"--{field.name.replace('_', '-')}"
+        for one in fields(PoseFlags):
+            if one.name in format.without and getattr(self.flags, one.name) != one.default:
+                flag = f"--{one.name.replace('_', '-')}"
                 raise FlagError(
                     f"{flag} changes nothing for {self.path}, which is read as {format.name}; leave it out."
                 )
@@ -137,17 +157,24 @@ class GivenPoses:
             raise FlagError(f"--poses-delay-ms is {delay:g}, but must be within 1e15.")
 
     def _times_of(
-        self, names: Sequence[str], frame_times: Mapping[str, int], notes: list[str]
-    ) -> tuple[Int64[np.ndarray, " poses"], list[int]]:
-        """Returns the times of images with these names, in order, and the number of the image of each."""
-        table, where = frame_times, "the frames of the recording"
+        self, names: Sequence[str], frames: Sequence[NamedFrames], notes: list[str]
+    ) -> tuple[Int64[np.ndarray, " poses"], list[int], Float64[np.ndarray, "poses 4 4"]]:
+        """Returns the times of images with these names, in order, and the number and the mounting of each image."""
+        where = "the frames of the recording"
         if self.flags.poses_times is not None:
             where = str(self.flags.poses_times)
             rows, numbers = read_rows(self.flags.poses_times, f"t_{self.unit} name")
             times = parse_times(self.flags.poses_times, [row[0] for row in rows], numbers, self.unit, "frames")
-            table = dict(zip((Path(row[1]).name for row in rows), times.tolist(), strict=True))
-        table = {Path(name).stem: time for name, time in table.items()} | dict(table)
-        at = {i: table[Path(name).name] for i, name in enumerate(names) if Path(name).name in table}
+            frames = [NamedFrames([Path(row[1]) for row in rows], times)]
+        whole: dict[str, list[tuple[int, np.ndarray]]] = {}
+        stems: dict[str, list[tuple[int, np.ndarray]]] = {}
+        for group in frames:
+            for file, time in zip(group.files, group.times.tolist(), strict=True):
+                whole.setdefault(file.name, []).append((time, group.mounting))
+                stems.setdefault(file.stem, []).append((time, group.mounting))
+        table = stems | whole
+        self._check_names([Path(name).name for name in names], table, where)
+        at = {i: table[Path(name).name][0] for i, name in enumerate(names) if Path(name).name in table}
         if len(at) < 2:
             raise RecordingError(
                 f"{self.path} holds poses of images such as {names[0]}, but {len(at)} of them have a time, as {where} "
@@ -156,15 +183,32 @@ class GivenPoses:
         if len(at) < len(names):
             notes.append(f"{len(names) - len(at):,} of {len(names):,} poses in {self.path.name} are left out, because "
                          "their image has no time.")  # fmt: skip
-        chosen = sorted(at, key=at.__getitem__)
-        times = np.array([at[i] for i in chosen], np.int64)
+        chosen = sorted(at, key=lambda i: at[i][0])
+        times = np.array([at[i][0] for i in chosen], np.int64)
         if (np.diff(times) <= 0).any():
             first = int(np.argmax(np.diff(times) <= 0))
             one, other = names[chosen[first]], names[chosen[first + 1]]
             raise RecordingError(
                 f"{self.path} holds poses of {one} and {other}, which have the same time; leave one out."
             )
-        return times, chosen
+        return times, chosen, np.stack([at[i][1] for i in chosen])
+
+    def _check_names(self, names: Sequence[str], table: dict[str, list[tuple[int, np.ndarray]]], where: str) -> None:
+        """Checks that frames of one name have one time, and one camera unless --hand-eye states where it is."""
+        for name in names:
+            (first, mounting), *others = table.get(name) or [(0, np.eye(4))]
+            for time, other_mounting in others:
+                if time != first:
+                    raise FlagError(
+                        f"{self.path} holds a pose of {name}, but two times of it are known from {where}, {first} ns "
+                        f"and {time} ns; give --poses-times FILE with one line “t name” for each image."
+                    )
+                if self.flags.hand_eye is None and (other_mounting != mounting).any():
+                    raise FlagError(
+                        f"{self.path} holds a pose of {name}, but {where} of this name are of two cameras; give "
+                        "--hand-eye FILE with the pose of the event camera in the axes of the one whose poses these "
+                        "are, 0 0 0 0 0 0 1 if it is the event camera."
+                    )
 
 
 @dataclass(frozen=True)
@@ -178,14 +222,14 @@ class RestPoses(GivenPoses):
     def unit(self) -> str:
         return "ns"
 
-    def rows(self, frame_times: Mapping[str, int], notes: list[str]) -> PoseRows:
-        times = [*self.times, *frame_times.values()] or [0]
+    def rows(self, frames: Sequence[NamedFrames], notes: list[str]) -> PoseRows:
+        times = [*self.times, *(time for group in frames for time in group.times.tolist())] or [0]
         ends = np.array([min(times), max(times) + 1])
         return ends, np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
 
 
 def poses_of(
-    path: Path, unit: str, given: GivenPoses | None, frame_times: Mapping[str, int], notes: list[str]
+    path: Path, unit: str, given: GivenPoses | None, frames: Sequence[NamedFrames], notes: list[str]
 ) -> PoseRows:
     """Returns the poses of a recording: those that the user gives, or else those of a text file in its folder.
 
@@ -193,14 +237,14 @@ def poses_of(
         path: The file, with lines t px py pz qx qy qz qw.
         unit: Unit of its times.
         given: Poses in place of the file.
-        frame_times, notes: Arguments of `GivenPoses.rows`.
+        frames, notes: Arguments of `GivenPoses.rows`.
 
     Raises:
         RecordingError: A file is missing, damaged, or holds fewer than two poses.
         FlagError: `GivenPoses.rows` raises it.
     """
     if given is not None:
-        return given.rows(frame_times, notes)
+        return given.rows(frames, notes)
     if not path.exists():
         raise RecordingError(
             f"{path} is missing, a text file with the columns t_{unit} px py pz qx qy qz qw of the event camera; add "

@@ -235,7 +235,7 @@ def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> Non
         flag: The flag that states the place of the results.
         output: The file or folder of the results, which may be missing.
         read: Files and folders of the input. Any other folder with `FILES_OF_A_RECORDING` files of a format counts as a
-            recording too.
+            recording too, where files of any name (*.bag, */*.db3) count as one.
 
     Raises:
         OutputError: The place lies in an input or a recording, or is one.
@@ -243,9 +243,18 @@ def check_outside_recordings(flag: str, output: Path, *read: Path | None) -> Non
     output = absolute(output)
     sources = {absolute(path) for path in read if path is not None}
     for place in (output, *output.parents):
-        if place in sources or max(_files_found(place).values()) >= FILES_OF_A_RECORDING:
+        if place in sources or _is_recording(place):
             where = "lies within the recording" if place.is_dir() else "would replace the file"
             raise OutputError(f"{flag} {output} {where} {place}, which is never written to; give a place elsewhere.")
+
+
+def _is_recording(path: Path) -> bool:
+    most = 0
+    for format in formats():
+        found = [pattern for pattern in format.files if _is_there(path, pattern)]
+        of_any_name = sum(pattern.removeprefix("*/").startswith("*.") for pattern in found)
+        most = max(most, len(found) - max(of_any_name - 1, 0))
+    return most >= FILES_OF_A_RECORDING
 
 
 def _files_found(path: Path) -> dict[Format, int]:

@@ -36,7 +36,7 @@ from enerf_ns.dataparsers.formats.event_recording import read_cameras
 from enerf_ns.dataparsers.formats.format import Format, FormatOptions
 from enerf_ns.dataparsers.formats.json_values import in_words
 from enerf_ns.dataparsers.formats.kept_frames import keep_frames
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames
 from enerf_ns.dataparsers.formats.robust_enerf import checked_camera, listed
 from enerf_ns.dataparsers.formats.ros_bags import messages_on, open_bag
 from enerf_ns.dataparsers.formats.ros_events import MESSAGE_TYPES, EventMessage, read_events
@@ -129,18 +129,18 @@ def read(
                 f"{size[0]} x {size[1]}; give the calibration for this resolution."
             )
     else:
-        camera, mounting = _read_camera(path, topics, events_topic, size), None
+        camera, mounting = _read_camera(path, topics, events_topic, size), np.eye(4)
         frame_camera = camera
     frames_topic = _choose_frames(path, topics, events_topic, bag_frames, notes)
     is_own = frame_camera is not camera or bag_frames is not None
     is_own |= frames_topic is not None and _namespace(frames_topic) == _namespace(events_topic)
     files, frame_times = _read_frames(path, frames_topic, frame_camera, is_own, notes)
-    stamps = {file.name: time for file, time in zip(files, frame_times.tolist(), strict=True)}
+    named = [NamedFrames(files, frame_times, mounting)]
     poses_file, unit = (path, "ns") if poses is None else (poses.path, poses.unit)
-    rows = read_bag(path, bag_poses, bag_tf, notes, POSE_FLAGS) if poses is None else poses.rows(stamps, notes)
+    rows = read_bag(path, bag_poses, bag_tf, notes, POSE_FLAGS) if poses is None else poses.rows(named, notes)
     zero = int(min(first, rows[0][0], *frame_times[:1]))
     trajectory = Trajectory(rows[0] - zero, *rows[1:])
-    of_frames = trajectory if frame_camera is camera or mounting is None else trajectory.of_mounted(mounting)
+    of_frames = trajectory if frame_camera is camera else trajectory.of_mounted(mounting)
     return EventRecording(
         path=folder,
         format="ros_bag",
@@ -148,6 +148,7 @@ def read(
         trajectory=trajectory,
         stream_events=lambda: _stream_events(path, events_topic, offset, zero),
         event_files=_files_of(path),
+        zero=zero,
         frames=Frames(files, frame_times - zero, frame_camera, of_frames) if files else None,
         notes=tuple(notes),
         times_in={"events": (path, "ns"), "poses": (poses_file, unit), "frames": (path, "ns")},

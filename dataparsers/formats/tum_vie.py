@@ -176,6 +176,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         trajectory=markers.of_mounted(marker_from_imu @ rig.imu_from_camera),
         stream_events=lambda: events.stream(zero),
         event_files=(events_file,),
+        zero=zero,
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,

@@ -123,6 +123,7 @@ def read(folder: Path, event_camera: Literal["left", "right"] = "left") -> Event
         trajectory=body.of_mounted(body_from_camera @ mount),
         stream_events=lambda: events.stream(zero),
         event_files=(events.path,),
+        zero=zero,
         frames=frames,
         notes=tuple(notes),
         num_events=events.num_events,

@@ -376,9 +376,15 @@ def encode_poses(
     return ("\n".join([header, *lines]) + "\n").encode()
 
 
-def encode_tum(trajectory: Trajectory) -> bytes:
-    """Returns a trajectory as text of the TUM benchmark: lines t px py pz qx qy qz qw, seconds and metres."""
-    stamps = (f"{'-' * (time < 0)}{abs(time) // 10**9}.{abs(time) % 10**9:09d}" for time in trajectory.times.tolist())
+def encode_tum(trajectory: Trajectory, zero: int) -> bytes:
+    """Returns a trajectory as text of the TUM benchmark: lines t px py pz qx qy qz qw, seconds and metres.
+
+    Args:
+        trajectory: The poses.
+        zero: Time (ns) that the text states for its time 0.
+    """
+    times = (trajectory.times + zero).tolist()
+    stamps = (f"{'-' * (time < 0)}{abs(time) // 10**9}.{abs(time) % 10**9:09d}" for time in times)
     return encode_poses("# t px py pz qx qy qz qw", stamps, trajectory.positions, trajectory.quaternions)
 
 

@@ -48,6 +48,8 @@ def load_index(name: str) -> tuple[EventIndex, Survey] | None:
         folder = cache_entry(name)
     except OSError:
         return None
+    if not os.path.lexists(folder):
+        return None
     try:
         stored = json.loads((folder / "index.json").read_text())
         for column in COLUMNS:
@@ -58,8 +60,6 @@ def load_index(name: str) -> tuple[EventIndex, Survey] | None:
         if len(times) != len(positives) or len(times) != survey.counts.sum():
             raise ValueError("the columns do not fit together")
         survey.hot_pixels = np.array(survey.hot_pixels, np.int64)
-    except FileNotFoundError:
-        return None
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(folder, ignore_errors=True)
         return None

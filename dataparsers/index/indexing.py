@@ -153,11 +153,7 @@ def _check(recording: EventRecording, survey: Survey) -> None:
         )
     recording.check_units(survey.num_events, survey.last - survey.first)
     if not survey.counts.any():
-        raise RecordingError(
-            f"The poses of {path} do not cover the events, which lie from {seconds(survey.first)} to "
-            f"{seconds(survey.last)} while the poses{' in the time range' * bool(recording.time_range)} lie from "
-            f"{seconds(survey.start)} to {seconds(survey.end)}; both must be on one clock."
-        )
+        raise recording.not_covered(survey.first, survey.last)
     if survey.counts.max() < 2:
         raise RecordingError(
             f"{path} holds {survey.counts.sum():,} events within the poses and never two at one pixel, but "

@@ -214,6 +214,8 @@ class Inspection:
                 rows[name] = (
                     f"{len(frames.times):,}, {_span(frames.times[0], frames.times[-1])}{depth}{frames.white_in_words}"
                 )
+        if recording.zero:
+            rows["time 0"] = f"{recording.zero} ns on the clock of the files"
         rows["event camera"] = _camera(recording.camera)
         frames = self._frames
         if frames is not None:

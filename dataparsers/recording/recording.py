@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int64, Shaped
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.recording.camera import Camera
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
@@ -260,6 +261,8 @@ class EventRecording:
     Default: the folder, ns."""
     read_with: Mapping[str, object] = field(default_factory=dict)
     """Options of the format, all of them, since some of them choose other events from the same files."""
+    zero: int = 0
+    """Time on the clock of the files at which the recording has its time 0, ns."""
     time_range: tuple[int, int] | None = None
     """First and last time (ns) of the selected range; None for the whole recording."""
     keep_hot_pixels: bool = False
@@ -423,6 +426,19 @@ class EventRecording:
         """
         check_units(self.path, self._all_times(num_events, span))
 
+    def not_covered(self, first: int, last: int) -> RecordingError:
+        """Returns the error for events of which none lies within the poses in use.
+
+        Args:
+            first, last: Times of the first and the last event, ns.
+        """
+        start, end = self.span
+        return RecordingError(
+            f"The poses of {self.path} do not cover the events, which lie from {seconds(first)} to {seconds(last)} "
+            f"while the poses{' in the time range' * bool(self.time_range)} lie from {seconds(start)} to "
+            f"{seconds(end)}; both must be on one clock."
+        )
+
     def unusual_units(self, num_events: int, span: int) -> str | None:
         """Returns what `time_units.unusual_units` says of events, poses and frames; takes what `check_units` takes."""
         return unusual_units(self._all_times(num_events, span))
@@ -544,13 +560,16 @@ def _with_smooth_poses(recording: EventRecording) -> EventRecording:
     noise = pose_noise(recording.trajectory)
     if noise is None:
         return recording
-    smooth = {id(recording.trajectory): noise.smooth}
+    given = recording.trajectory
+    smooth = {id(given): noise.smooth}
 
     def of(frames: Frames | None) -> Frames | None:
         if frames is None:
             return None
         own = frames.trajectory
-        if id(own) not in smooth:
+        if id(own) not in smooth and np.array_equal(own.times, given.times):
+            smooth[id(own)] = _carried(own, given, noise.smooth)
+        elif id(own) not in smooth:
             found = pose_noise(own)
             smooth[id(own)] = own if found is None else found.smooth
         return replace(frames, trajectory=smooth[id(own)])
@@ -558,6 +577,13 @@ def _with_smooth_poses(recording: EventRecording) -> EventRecording:
     frames = {kind: of(getattr(recording, kind)) for kind in KINDS_OF_FRAMES}
     taken_off = noise.position, noise.rotation
     return replace(recording, trajectory=noise.smooth, pose_noise_taken_off=taken_off, **frames)
+
+
+def _carried(own: Trajectory, given: Trajectory, smooth: Trajectory) -> Trajectory:
+    """Returns the trajectory of a camera beside another one, whose poses at the same times are smoothed."""
+    turns = Rotation.from_quat(smooth.quaternions) * Rotation.from_quat(given.quaternions).inv()
+    positions = smooth.positions + turns.apply(own.positions - given.positions)
+    return Trajectory(own.times, positions, (turns * Rotation.from_quat(own.quaternions)).as_quat())
 
 
 @cache

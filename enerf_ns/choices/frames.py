@@ -9,7 +9,12 @@ import numpy as np
 from enerf_ns.choices.events import frames_determine_more
 from enerf_ns.choices.extent import depths
 from enerf_ns.choices.scene import DATAPARSER, Scene
-from enerf_ns.dataparsers.event_dataparser import DEFAULT_HELD_OUT_EVERY, EventDataParserConfig, split_frames
+from enerf_ns.dataparsers.event_dataparser import (
+    DEFAULT_HELD_OUT_EVERY,
+    EventDataParserConfig,
+    check_trained_frames,
+    split_frames,
+)
 from enerf_ns.dataparsers.recording.errors import FlagError
 from enerf_ns.dataparsers.recording.recording import Frames
 from enerf_ns.dataparsers.sensor_estimates.frame_contrast import EXPOSURE_CHANGES, exposure_change
@@ -29,7 +34,7 @@ def split(scene: Scene) -> None:
     """Which frames are for training, and which are held out? This has no row.
 
     Raises:
-        FlagError: The recording holds no frames to learn from, or too few for the split.
+        FlagError: The recording holds no frames to learn from, or too few for the split, or none of them is chosen.
     """
     recording, supervision = scene.recording, scene.config.datamanager.supervision
     if scene.use_frames and not recording.has_frames:
@@ -47,6 +52,8 @@ def split(scene: Scene) -> None:
             f"{recording.path}: --held-out-every {every} splits none of {num_frames} frames off; it must be at least 2 "
             "and less than twice their number, where the field learns from frames"
         )
+    if scene.use_frames:
+        check_trained_frames(recording, scene.parser, split_frames(recording, scene.parser, held_out=False)[0])
 
 
 def frame_loss(scene: Scene) -> None:

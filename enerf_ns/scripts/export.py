@@ -129,11 +129,11 @@ class Export:
         from enerf_ns.dataparsers.formats.writer import camera_json, encode_tum
         from enerf_ns.poses.findings import findings
 
-        recording, refiner = pipeline.datamanager.recording, pipeline.poses
-        found = [] if refiner is None else findings(refiner, pipeline.datamanager.distance)
+        recording = pipeline.datamanager.recording
+        found = findings(pipeline.poses, pipeline.datamanager.distance)
         camera = {**camera_json(recording.camera), "corrections": [row.as_dict() for row in found]}
         about = (json.dumps(camera, indent=2) + "\n").encode()
-        _write(output, {output.name: encode_tum(recording.trajectory), f"{output.name}.json": about})
+        _write(output, {output.name: encode_tum(recording.trajectory, recording.zero), f"{output.name}.json": about})
         corrected = [f"{row.what}: {row.value}" for row in found if row.is_corrected]
         for line in corrected or ["No error of the poses was found. They are those of the recording."]:
             print(printable(line))

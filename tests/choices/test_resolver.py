@@ -265,6 +265,23 @@ def test_missed_changes_are_added_where_events_tell_them(recording: Path):
     assert not row.kept and "within the refractory period" in row.why
 
 
+def test_missed_changes_are_added_only_for_a_refractory_period_that_is_known_and_stays(recording: Path):
+    scene, config = of_blind_sensor(recording, 100_000), copy.deepcopy(ENERF)
+    config.model.sensor.learn_refractory_period = True
+    resolution = resolve(config, scene)
+    values = resolution.values
+    assert values["datamanager.completed_refractory_ns"] == 0 and values["datamanager.pair_mode"] == "successor"
+    assert "is learned" in rows(resolution)["missed changes"].why
+    for is_learned, completed, expected in (
+        (True, 100_000, "is 100000, but 0 was expected"),
+        (False, 90_000, "is 90000, but 0, or the refractory period of 100000, was expected"),
+    ):
+        config.model.sensor.learn_refractory_period = is_learned
+        config.datamanager.completed_refractory_ns = completed
+        with pytest.raises(FlagError, match=f"^--pipeline.datamanager.completed-refractory-ns {expected}"):
+            resolve(config, scene)
+
+
 def test_of_noisy_events_frames_have_more_rays_at_less_cost(recording: Path):
     """Events that alternate cancel; of events with a polarity drawn by chance, each adds its square."""
     drawn = {}
@@ -518,7 +535,8 @@ def test_every_row_names_a_flag_of_ns_train_and_both_answers_can_be_forced(recor
             owner = config.poses if hasattr(config.poses, field) else owner
             assert hasattr(owner, field)
             setattr(owner, field, value)
-            row = rows(resolve(config, distorted)).get(part)
+            blind = 1000 if part == "missed changes" else 0
+            row = rows(resolve(config, replace(distorted, refractory_period=blind))).get(part)
             if part == "pose gaps":  # there are none to keep
                 assert row is not None and not row.kept
             else:
@@ -579,6 +597,16 @@ def test_sharp_frames_are_instants(recording: Path):
 def test_an_exposure_that_no_frame_can_have_is_refused(recording: Path, exposure_ms: float, message: str):
     with pytest.raises(FlagError, match=message):
         resolve(frames_config(exposure_ms=exposure_ms), read_recording(recording))
+
+
+def test_a_time_range_without_frames_is_for_events_alone(recording: Path):
+    whole = read_recording(recording)
+    assert whole.frames is not None and whole.blurred_frames is not None
+    first, second = (np.union1d(whole.frames.times, whole.blurred_frames.times)[:2] * 1e-9).tolist()
+    between = 0.75 * first + 0.25 * second, 0.25 * first + 0.75 * second
+    with pytest.raises(FlagError, match=r"--time-range holds none of the frames .* to train on, which lie from"):
+        resolve(frames_config(time_range=between), whole)
+    resolve(frames_config("events", time_range=between), whole)
 
 
 def test_a_lens_may_be_ignored(recording: Path):

@@ -345,6 +345,45 @@ def test_a_time_range_limits_events_and_frames(tmp_path: Path):
         read_recording(folder, time_range=(7.0, 9.0))
 
 
+def test_frames_that_are_stated_for_training_are_not_held_out_by_default(tmp_path: Path):
+    folder = write_esim(tmp_path / "esim")
+    assert frame_numbers(parse(folder, train_frame_indices=(2,))) == [2]
+    assert frame_numbers(parse(folder, "val", train_frame_indices=(2,))) == [0, 1]
+
+
+def test_stated_numbers_choose_among_frames_beside_held_out_views(tmp_path: Path):
+    """The views lie on a trajectory of their own, and are evaluated if no numbers are stated."""
+    recording = read_recording(write_esim(tmp_path / "esim"))
+    assert recording.frames is not None
+    recording = replace(recording, held_out_frames=recording.frames.subset(np.array([1])))
+    for stated, expected in (((0, 2), [0, 2]), (None, [1])):
+        frames, _ = split_frames(recording, EventDataParserConfig(held_out_frame_indices=stated), held_out=True)
+        assert frames.numbers.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("split", "options", "message"),
+    [
+        ("train", {"train_frame_indices": (98, 99)}, r"train-frame-indices 98 99 chooses none .* numbers from 0 to 2;"),
+        ("val", {"held_out_frame_indices": (99,)}, r"held-out-frame-indices 99 chooses none .* numbers from 0 to 2;"),
+        ("val", {"train_frame_indices": (0, 1, 2)}, r"train-frame-indices takes all frames of .*none is held out;"),
+        ("train", {"held_out_frame_indices": (0, 1, 2)}, r"held-out-frame-indices takes all .*none is left to train"),
+        ("train", {"time_range": (0.2, 0.4)}, r"time-range holds none .* lie from 0\.150000 s to 0\.\d+ s;"),
+    ],
+)
+def test_frames_that_a_flag_does_not_leave_are_one_sentence(tmp_path: Path, split: str, options: dict, message: str):
+    """In place of a split with frames of the other one, or of other times."""
+    config = EventDataParserConfig(data=write_esim(tmp_path / "esim"), depth_range=(NEAR, FAR), **options)
+    with pytest.raises(SystemExit, match=rf"^enerf: event-data --{message}[^.]*\.$"):
+        config.setup().get_dataparser_outputs(split)
+
+
+def test_events_alone_need_no_frame_in_the_time_range(tmp_path: Path):
+    """Their cameras are shown, and nothing is learnt from their pictures."""
+    outputs = parse(write_esim(tmp_path / "esim"), time_range=(0.2, 0.4), picture_files=False)
+    assert len(index_events(outputs.metadata["recording"])) and len(outputs.cameras)
+
+
 OUTSIDE = {
     **{
         f"{name} {value}": {name: value}

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import EVENTS, joined, write_esim
+from recordings import EVENTS, FRAME_TIMES, POSE_TIMES, joined, write_davis, write_esim
 from test_event_files import FORMATS, events
 
 from enerf_ns.dataparsers.formats.conversion import convert_event_file, convert_recording, new_folder
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags, RestPoses
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, OutputError, RecordingError
 
@@ -31,6 +33,21 @@ def test_an_event_file(tmp_path: Path):
     assert sorted(path.name for path in (tmp_path / "new/events").iterdir()) == ["p.npy", "t.npy", "x.npy", "y.npy"]
 
 
+def test_poses_on_the_clock_of_the_files_fit_by_the_stated_time_0(tmp_path: Path):
+    """As those of a tracker, for a recording that was converted before they were there."""
+    source = write_davis(tmp_path / "davis", zero=1_700_000_000 * 10**9)
+    first, *_ = convert_recording(source, tmp_path / "first", RestPoses(source))
+    zero = int(re.findall(r"Time 0 of the new recording is (\d+) ns", first)[0])
+    assert zero == 1_700_000_000 * 10**9 + min(FRAME_TIMES[0], EVENTS[0, 2])
+    poses = source / "groundtruth.txt"
+    with pytest.raises(RecordingError, match="both must be on one clock"):
+        convert_recording(tmp_path / "first", tmp_path / "second", GivenPoses(poses))
+    assert not (tmp_path / "second").exists()
+    convert_recording(tmp_path / "first", tmp_path / "second", GivenPoses(poses, PoseFlags(poses_delay_ms=zero * 1e-6)))
+    times = read_recording(tmp_path / "second").trajectory.times
+    assert np.abs(times - (POSE_TIMES + 1_700_000_000 * 10**9 - zero)).max() < 1000  # ns, of float64 milliseconds
+
+
 @pytest.mark.parametrize("convert", [convert_recording, convert_event_file])
 def test_what_cannot_be_written_or_read_leaves_nothing(tmp_path: Path, convert):
     source = write_esim(tmp_path / "esim")
@@ -45,6 +62,12 @@ def test_what_cannot_be_written_or_read_leaves_nothing(tmp_path: Path, convert):
     with pytest.raises(OutputError, match="could not be written"):
         convert(source, tmp_path / "full/mine/new")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_mount_point_is_refused_before_the_work(tmp_path: Path):
+    """As that of docker run -v "$PWD/out:/out". The root of all folders is one on any machine."""
+    with pytest.raises(OutputError, match=r"^/ is a mount point, .*; give a folder in it .*such as /recording\.$"):
+        convert_recording(tmp_path / "missing", Path("/"))
 
 
 def test_what_another_command_wrote_meanwhile_stays(tmp_path: Path):

@@ -27,6 +27,7 @@ from recordings import (
     write_image,
 )
 from scipy.spatial.transform import Rotation, Slerp
+from test_bad_input import is_one_sentence
 
 from enerf_ns.dataparsers.formats import event_recording
 from enerf_ns.dataparsers.formats.conversion import convert_recording
@@ -101,6 +102,38 @@ def test_reads_what_was_written(tmp_path: Path):
     assert recording.blurred_frames.depth_filenames is None and recording.frames.depth_filenames is not None
     assert [np.load(file).max() for file in recording.frames.depth_filenames] == [1.0, 2.0, 3.0]
     assert list(recording.notes) == []
+
+
+def test_frames_keep_their_numbers(tmp_path: Path):
+    """Which count those that are left out, since they have no pose."""
+    folder = write_esim(tmp_path / "esim")
+    rows = (folder / "0_poses_all.txt").read_text().splitlines()
+    (folder / "0_poses_all.txt").write_text("\n".join([rows[0], *rows[4:]]))  # begin after the first frame
+    for source, new in (("esim", "first"), ("first", "second")):
+        convert_recording(tmp_path / source, tmp_path / new)
+        frames = read_recording(tmp_path / new).frames
+        assert frames is not None and frames.numbers.tolist() == [1, 2]
+        assert frames.times.tolist() == FRAME_TIMES[1:].tolist()
+    convert_recording(write_esim(tmp_path / "whole"), tmp_path / "third")
+    assert not (tmp_path / "third/frames/numbers.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ("1\n3\n", "holds 3 images, but its numbers.txt holds 2 numbers"),
+        ("1\n1\n3\n", "line 2 holds 1, but whole numbers from 0 to 1,000,000,000 were expected, each above"),
+        ("1\n2.5\n3\n", "line 2 holds 2.5, but"),
+        ("-2\n-1\n0\n", "line 1 holds -2, but"),
+        ("0\n1e300\n2e300\n", "line 2 holds 1e300, but"),
+    ],
+)
+def test_numbers_that_cannot_be_are_one_sentence(tmp_path: Path, numbers: str, message: str):
+    folder = write_recording(tmp_path / "own", ("frames",))
+    (folder / "frames/numbers.txt").write_text(numbers)
+    with pytest.raises(RecordingError, match=message) as error:
+        read_recording(folder)
+    assert is_one_sentence(str(error.value))
 
 
 def test_what_is_optional_may_be_missing(tmp_path: Path):

@@ -966,6 +966,7 @@ def check_plain(recording: EventRecording, rows: np.ndarray, plain: Plain) -> No
     zero = 0
     if not plain.starts_at_zero:
         zero = min(plain.events[0, 2], plain.pose_times[0], *plain.stamps[:1])
+    assert recording.zero == zero
     assert recording.num_events in (None, len(rows)) and len(rows) == len(plain.events)
     np.testing.assert_array_equal(rows[:, [0, 1, 3]], plain.events[:, [0, 1, 3]])
     assert np.abs(rows[:, 2] - (plain.events[:, 2] - zero)).max() <= 1

@@ -139,6 +139,13 @@ def test_events_alone(tmp_path: Path):
         read_recording(folder, event_camera="right")
 
 
+def test_times_of_poses_may_be_floats(tmp_path: Path):
+    """As the published files hold them before 28 February 2025."""
+    folder = write_m3ed(tmp_path / "m3ed")
+    changed("ts", (POSE_TIMES // 1000).astype(np.float64) + 0.25, "seq_pose_gt.h5")(folder)
+    np.testing.assert_array_equal(read_recording(folder).trajectory.times, POSE_TIMES)
+
+
 def changed(name: str, value: Any, file: str = "seq_data.h5") -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         with h5py.File(folder / file, "r+") as opened:

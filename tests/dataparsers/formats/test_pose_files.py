@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,12 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_dsec
+import test_m3ed
+import torch
 from recordings import FRAME_TIMES, POSE_TIMES, write_davis, write_esim
 from scipy.spatial.transform import Rotation, Slerp
 from test_bad_input import is_one_sentence
-from test_event_recording import write_recording
+from test_event_recording import CAMERA, write_recording
 
-from enerf_ns.dataparsers.formats.pose_files import GivenPoses, PoseFlags
+from enerf_ns.dataparsers.formats.pose_files import GivenPoses, NamedFrames, PoseFlags
 from enerf_ns.dataparsers.formats.registry import read_recording
 from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError, UserError
 
@@ -49,12 +53,16 @@ def lines(times: np.ndarray, rows: np.ndarray, unit: str = "s", separator: str =
     return "".join(separator.join([time, *map(repr, row)]) + "\n" for time, row in pairs)
 
 
+def named(frame_times: dict[str, int]) -> list[NamedFrames]:
+    return [NamedFrames([*map(Path, frame_times)], np.array([*frame_times.values()], np.int64))]
+
+
 def read(
     path: Path, frame_times: dict[str, int] | None = None, **flags: Any
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Times, matrices and notes."""
     notes: list[str] = []
-    times, positions, quaternions = GivenPoses(path, PoseFlags(**flags)).rows(frame_times or {}, notes)
+    times, positions, quaternions = GivenPoses(path, PoseFlags(**flags)).rows(named(frame_times or {}), notes)
     matrices = np.tile(np.eye(4), (len(times), 1, 1))
     matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), positions
     return times, matrices, notes
@@ -355,15 +363,96 @@ def test_a_recording_takes_poses_in_place_of_its_own(tmp_path: Path, write: Call
     np.testing.assert_allclose(recording.trajectory.positions, MATRICES[:, :3, 3], atol=1e-12)
     assert recording.frames is not None and recording.frames.trajectory is recording.trajectory
 
-    colmap = write_colmap(tmp_path / "0", "text")
-    text = (colmap / "images.txt").read_text()
-    for i, file in enumerate(recording.frames.files_of_recording[: len(FRAME_TIMES)]):
-        text = text.replace(f"frame {i}.png", file.name)
-    (colmap / "images.txt").write_text(text)
+    names = [file.name for file in recording.frames.files_of_recording[: len(FRAME_TIMES)]]
+    colmap, matrices = colmap_of(names, tmp_path / "0")
     recording = read_recording(folder, poses=GivenPoses(colmap, PoseFlags(poses_scale=2.0)))
     np.testing.assert_array_equal(np.diff(recording.trajectory.times), np.diff(FRAME_TIMES))
-    order = [NAMES.index(f"frame {i}.png") for i in range(3)]
-    np.testing.assert_allclose(recording.trajectory.positions, 2 * MATRICES[order, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(recording.trajectory.positions, 2 * matrices[:, :3, 3], atol=1e-12)
+
+
+def colmap_of(frames: list[str], folder: Path) -> tuple[Path, np.ndarray]:
+    """A model with a pose of each of these images, and the poses in their order, camera to world."""
+    colmap = write_colmap(folder, "text")
+    text = (colmap / "images.txt").read_text()
+    for i, name in enumerate(frames):
+        text = text.replace(f"frame {i}.png", name)
+    (colmap / "images.txt").write_text(text)
+    return colmap, MATRICES[[NAMES.index(f"frame {i}.png") for i in range(len(frames))]]
+
+
+def two_cameras(folder: Path, *frames: str, **about: Any) -> Path:
+    mounting = np.linalg.inv(MOUNT).tolist()
+    return write_recording(folder, frames, frame_camera={**CAMERA, "event_camera_from_frame_camera": mounting}, **about)
+
+
+TWO_CAMERAS: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
+    "event_recording": (lambda folder: two_cameras(folder, "frames"), {}),
+    "dsec": (test_dsec.write_dsec, {}),
+    "dsec, right": (test_dsec.write_dsec, {"event_camera": "right"}),
+    "m3ed": (test_m3ed.write_m3ed, {}),
+    "m3ed, right": (test_m3ed.write_m3ed, {"event_camera": "right"}),
+}
+
+
+@pytest.mark.parametrize("name", TWO_CAMERAS)
+def test_poses_of_frames_are_those_of_their_camera(tmp_path: Path, name: str):
+    """The event camera then keeps the place in its axes that it has with poses of its own."""
+    write, options = TWO_CAMERAS[name]
+    write(tmp_path / "recording")
+    own = read_recording(tmp_path / "recording", **options)
+    assert own.frames is not None
+    names = [file.name for file in own.frames.filenames] if "m3ed" not in name else [f"{i:05d}.png" for i in range(3)]
+    colmap, matrices = colmap_of(names, tmp_path / "0")
+    found = read_recording(tmp_path / "recording", poses=GivenPoses(colmap, PoseFlags(poses_scale=0.5)), **options)
+    assert found.frames is not None and any("second camera" in note for note in found.notes)
+    times = torch.from_numpy(found.frames.times)
+    poses = found.frames.trajectory.poses(times).numpy()
+    matrices[:, :3, 3] *= 0.5
+    np.testing.assert_allclose(poses, matrices[:, :3], atol=1e-9)
+    mounts = []
+    for recording in (own, found):
+        assert recording.frames is not None
+        at = torch.from_numpy(recording.frames.times)
+        frame = np.tile(np.eye(4), (len(at), 1, 1))
+        event = frame.copy()
+        frame[:, :3] = recording.frames.trajectory.poses(at).numpy()
+        event[:, :3] = recording.trajectory.poses(at).numpy()
+        mounts.append(np.linalg.inv(frame) @ event)
+    np.testing.assert_allclose(mounts[1], mounts[0], atol=1e-9)
+    assert np.abs(mounts[0] - np.eye(4)).max() > 0.01
+
+
+def test_a_hand_eye_transform_replaces_the_stated_mounting(tmp_path: Path):
+    colmap, matrices = colmap_of([f"{i}.png" for i in range(3)], tmp_path / "0")
+    (tmp_path / "mount.txt").write_text("0 0 0 0 0 0 1")
+    given = GivenPoses(colmap, PoseFlags(hand_eye=tmp_path / "mount.txt"))
+    recording = read_recording(two_cameras(tmp_path / "recording", "frames"), poses=given)
+    np.testing.assert_allclose(recording.trajectory.positions, matrices[:, :3, 3], atol=1e-12)
+    assert not any("second camera" in note for note in recording.notes)
+
+
+def test_frames_of_one_name_are_not_mixed_up(tmp_path: Path):
+    """Sharp and blurred frames of other times or of another camera have the same names, as they are written."""
+    colmap, matrices = colmap_of([f"{i}.png" for i in range(3)], tmp_path / "0")
+    both = "frames", "blurred_frames"
+    folder = write_recording(tmp_path / "recording", both)
+    later = FRAME_TIMES + 100_000_000
+    (folder / "blurred_frames/stamps_ns.txt").write_text("".join(f"{time}\n" for time in later.tolist()))
+    with pytest.raises(FlagError, match=r"holds a pose of \d\.png, but two times .*; give --poses-times FILE"):
+        read_recording(folder, poses=GivenPoses(colmap))
+    rows = [f"{time} {i}.png\n" for i, time in enumerate(later.tolist())]
+    (tmp_path / "times.txt").write_text("".join(rows))
+    given = GivenPoses(colmap, PoseFlags(poses_times=tmp_path / "times.txt", poses_unit="ns"))
+    found = read_recording(folder, poses=given).trajectory
+    np.testing.assert_array_equal(found.times, later)
+    np.testing.assert_allclose(found.positions, matrices[:, :3, 3], atol=1e-12)
+
+    folder = two_cameras(tmp_path / "two", *both, reconstructed_by="E2VID")
+    with pytest.raises(FlagError, match=r"of this name are of two cameras; give --hand-eye FILE"):
+        read_recording(folder, poses=GivenPoses(colmap))
+    shutil.rmtree(folder / "frames")
+    found = read_recording(folder, poses=GivenPoses(colmap)).trajectory
+    np.testing.assert_allclose(found.positions, matrices[:, :3, 3], atol=1e-12)
 
 
 def lines_file(folder: Path) -> Path:
@@ -454,5 +543,5 @@ def test_wrong_poses_are_one_sentence(tmp_path: Path, name: str):
     poses, expected = wrong(name, tmp_path)
     times = dict.fromkeys(NAMES, 5) if name == "same time" else {}
     with pytest.raises(UserError) as caught:
-        poses.rows(times, [])
+        poses.rows(named(times), [])
     assert expected in str(caught.value) and is_one_sentence(str(caught.value))

@@ -188,6 +188,20 @@ def test_the_published_cameras_of_tum_vie_are_those_of_its_calibration(shared_da
     np.testing.assert_allclose(poses[0] @ event_from_frame, poses[1], atol=1e-12)
 
 
+@pytest.mark.parametrize("bags", [("a.bag", "b/b.db3"), ("a/a.mcap", "b/b.db3"), ("a.bag", "b.mcap")])
+def test_a_folder_of_bags_may_hold_results(tmp_path: Path, bags: tuple[str, ...]):
+    """Beside them, not within the folder of one."""
+    for bag in bags:
+        (tmp_path / bag).parent.mkdir(exist_ok=True)
+        (tmp_path / bag).touch()
+    check_outside_recordings("--output-dir", tmp_path / "results/new")
+    for file in ("metadata.yaml", "b.db3"):
+        (tmp_path / "b").mkdir(exist_ok=True)
+        (tmp_path / "b" / file).touch()
+    with pytest.raises(OutputError, match=r"lies within the recording .*b, which is never written to"):
+        check_outside_recordings("--output-dir", tmp_path / "b/new")
+
+
 def test_a_folder_that_is_removed_while_it_is_looked_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As temporary folders are, which other processes make beside an output."""
     write_esim(tmp_path / "esim")

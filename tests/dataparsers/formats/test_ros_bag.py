@@ -475,6 +475,17 @@ def test_frames_are_kept_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         ros_bag.read(folder)
 
 
+@pytest.mark.parametrize("lost", ["stamps_ns.npy", "000001.png"])
+def test_kept_frames_of_which_a_file_is_lost_are_written_again(tmp_path: Path, lost: str):
+    folder = write_bag(tmp_path / "bag")
+    first = frames_of(folder)
+    pictures = [file.read_bytes() for file in first.filenames]
+    (first.filenames[0].parent / lost).unlink()
+    again = frames_of(folder)
+    np.testing.assert_array_equal(again.times, first.times)
+    assert [file.read_bytes() for file in again.filenames] == pictures
+
+
 def test_topics_are_chosen(tmp_path: Path):
     bag = Bag(
         events_topics=("/dvs/events", "/right/events"),

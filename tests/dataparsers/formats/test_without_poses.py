@@ -106,6 +106,15 @@ def test_a_clock_below_zero(tmp_path: Path):
     np.testing.assert_array_equal(np.load(tmp_path / "new/events/t.npy"), np.load(folder / "events/t.npy"))
 
 
+def test_sharp_and_blurred_frames_of_the_same_names_are_kept(tmp_path: Path):
+    """The blurred ones begin earlier and end later than the events and the sharp ones."""
+    folder = write_recording(tmp_path / "recording", ("frames", "blurred_frames"))
+    (folder / "blurred_frames/stamps_ns.txt").write_text("-5000000000\n450000000\n5000000000\n")
+    (folder / "poses.txt").unlink()
+    convert_recording(folder, tmp_path / "new", RestPoses(folder))
+    np.testing.assert_array_equal(times_of(tmp_path / "new"), times_of(folder))
+
+
 @pytest.mark.parametrize("has_frames", [True, False])
 def test_frames_from_events_need_no_poses(recording: Path, tmp_path: Path, has_frames: bool):
     """They are those of the same recording with poses from the first to the last event."""

@@ -10,6 +10,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,7 +26,7 @@ from recordings import joined
 from scipy.spatial.transform import Rotation
 
 from enerf_ns.dataparsers.formats.registry import layouts, open_writer, read_recording
-from enerf_ns.dataparsers.formats.writer import Setup, Writer
+from enerf_ns.dataparsers.formats.writer import Setup, Writer, encode_tum
 from enerf_ns.dataparsers.index.indexing import index_events
 from enerf_ns.dataparsers.inspection.problems import find_problems
 from enerf_ns.dataparsers.recording.camera import Camera
@@ -708,3 +709,11 @@ def test_what_a_layout_cannot_hold_is_refused(tmp_path: Path, layout: str, chang
         open_writer(layout, tmp_path, setup_of(layout, **changes))
     assert str(caught.value).endswith(".") and "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("zero", [0, -1_000_000_001, 1_468_939_802_123_456_789])
+def test_text_of_poses_states_the_clock_of_the_files_to_the_nanosecond(zero: int):
+    times = np.array([-5, 0, 7, 3_000_000_000])
+    poses = Trajectory(times, np.zeros((4, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)))
+    _, *lines = encode_tum(poses, zero).decode().splitlines()
+    assert [Decimal(line.split()[0]) * 10**9 - zero for line in lines] == times.tolist()
