@@ -224,7 +224,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         views, _ = held_out_views(run.pipeline, evidence=False)
         scores, _ = mean_scores(views, False, "log-affine-set", ())
         events = run.pipeline.event_scores()
-    manager, refiner = run.pipeline.datamanager, run.pipeline.poses
+    manager = run.pipeline.datamanager
     true = read_recording(right).trajectory
     before, after = manager.recording.as_read or manager.recording, manager.recording
     given = read_recording(folder)
@@ -234,7 +234,7 @@ def trained(cell: dict[str, Any], work: Path) -> dict[str, Any]:
         **{key: float(scores[key]) for key in ("psnr", "ssim", "depth_rmse") if isinstance(scores.get(key), float)},
         "event_correlation": events["event_correlation"],
         "seconds": run.train_seconds,
-        "corrected": [] if refiner is None else refiner.corrected,
+        "corrected": run.pipeline.poses.corrected,
         "clock": manager.corrections.delay,
         "focal": after.camera.fx / before.camera.fx,
         "ate_before": errors(true, given.trajectory),

@@ -285,7 +285,7 @@ def _split_frames(recording: EventRecording, config: EventDataParserConfig, held
     stated, others = config.train_frame_indices, config.held_out_frame_indices
     if held_out:
         stated, others = others, stated
-    if held_out and recording.held_out_frames and stated is None:
+    if held_out and recording.held_out_frames and (stated is None or not recording.has_frames):
         return recording.held_out_frames, True
     frames = recording.frames or recording.blurred_frames or event_pictures(recording)
     train_frames = config.train_frames or ("blurred" if recording.reconstructed_by else "sharp")

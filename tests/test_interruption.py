@@ -8,6 +8,7 @@ import shlex
 import shutil
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,10 @@ def test_a_run_that_has_no_checkpoint_yet_is_not_written_over_but_starts_again(
     loaded = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
     loaded.save_config()
     assert json.loads((folder / "origin.json").read_text())["command"] == "ns-train enerf --machine.seed 7"
+    an_hour_ago = time.time() - 3600.0
+    os.utime(folder / "config.yml", (an_hour_ago, an_hour_ago))  # of a start that failed
+    small_config(recording, tmp_path, data__event_pairs=32).save_config()
+    assert (folder / "config.yml").read_bytes() != before[folder / "config.yml"]
 
 
 def test_processes_of_a_run_that_goes_on_draw_batches_of_their_own(recording: Path, tmp_path: Path, monkeypatch):

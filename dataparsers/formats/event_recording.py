@@ -59,7 +59,14 @@ from enerf_ns.dataparsers.recording.errors import FlagError, RecordingError
 from enerf_ns.dataparsers.recording.files import check_is_folder, files_in, is_deep, load_array, of_file, write_whole
 from enerf_ns.dataparsers.recording.hdf5_files import file_of, is_deep_picture, load_depth_map, load_picture
 from enerf_ns.dataparsers.recording.ranges import COUNT
-from enerf_ns.dataparsers.recording.recording import EVENTS_AT_A_TIME, LARGEST_GAMMA, EventRecording, Events, Frames
+from enerf_ns.dataparsers.recording.recording import (
+    EVENTS_AT_A_TIME,
+    LARGEST_GAMMA,
+    MOUNTING_TOLERANCE,
+    EventRecording,
+    Events,
+    Frames,
+)
 from enerf_ns.dataparsers.recording.trajectory import Trajectory
 
 FILES = ("events/x.npy", "events/t.npy", "recording.json", "poses.txt")
@@ -69,9 +76,6 @@ OPTIONAL_KEYS = (
     *("reconstructed_by", "white_level", "frame_gamma"),
 )
 STAMPS_NAME, EXPOSURES_NAME, NUMBERS_NAME = "stamps_ns.txt", "exposures_ns.txt", "numbers.txt"
-
-MOUNTING_TOLERANCE = 1e-6
-"""Largest motion of the frame camera in the axes of the event camera: metres, and entries of the rotation."""
 
 
 def read(folder: Path, poses: GivenPoses | None = None) -> EventRecording:

@@ -162,6 +162,11 @@ class GivenPoses:
         """Returns the times of images with these names, in order, and the number and the mounting of each image."""
         where = "the frames of the recording"
         if self.flags.poses_times is not None:
+            if self.flags.hand_eye is None and any((group.mounting != np.eye(4)).any() for group in frames):
+                notes.append(
+                    f"Poses in {self.path.name} are taken as those of the event camera; if they are those of the "
+                    "frame camera, give the pose of the event camera in its axes as --hand-eye."
+                )
             where = str(self.flags.poses_times)
             rows, numbers = read_rows(self.flags.poses_times, f"t_{self.unit} name")
             times = parse_times(self.flags.poses_times, [row[0] for row in rows], numbers, self.unit, "frames")

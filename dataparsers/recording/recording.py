@@ -38,6 +38,9 @@ CONTRAST_THRESHOLD_LIMITS = (1e-3, 10.0)
 """Least and largest contrast threshold, change of log brightness. Sensors have more than ten times the least. The
 largest is a change of brightness by e^10, which is 22,000."""
 
+MOUNTING_TOLERANCE = 1e-6
+"""Largest motion of a camera in the axes of one that it is mounted beside: metres, and entries of the rotation."""
+
 DEPTH_LIMITS = (1e-6, 1e9)
 """Least and largest depth, metres."""
 
@@ -567,7 +570,7 @@ def _with_smooth_poses(recording: EventRecording) -> EventRecording:
         if frames is None:
             return None
         own = frames.trajectory
-        if id(own) not in smooth and np.array_equal(own.times, given.times):
+        if id(own) not in smooth and _is_mounted(own, given):
             smooth[id(own)] = _carried(own, given, noise.smooth)
         elif id(own) not in smooth:
             found = pose_noise(own)
@@ -577,6 +580,16 @@ def _with_smooth_poses(recording: EventRecording) -> EventRecording:
     frames = {kind: of(getattr(recording, kind)) for kind in KINDS_OF_FRAMES}
     taken_off = noise.position, noise.rotation
     return replace(recording, trajectory=noise.smooth, pose_noise_taken_off=taken_off, **frames)
+
+
+def _is_mounted(own: Trajectory, given: Trajectory) -> bool:
+    """Returns whether a camera has the same pose in the axes of another one at all of its poses."""
+    if not np.array_equal(own.times, given.times):
+        return False
+    back = Rotation.from_quat(given.quaternions).inv()
+    places = back.apply(own.positions - given.positions)
+    turns = (back * Rotation.from_quat(own.quaternions)).as_matrix()
+    return bool(max(np.ptp(places, axis=0).max(), np.ptp(turns, axis=0).max()) < MOUNTING_TOLERANCE)
 
 
 def _carried(own: Trajectory, given: Trajectory, smooth: Trajectory) -> Trajectory:

@@ -16,7 +16,10 @@ SIMULATION = (
     "enerf_ns.dataparsers.formats.esim",
     "enerf_ns.dataparsers.formats.event_recording",
 )
-"""Modules that make the recordings of the experiments. All that they import counts, too."""
+"""Modules that make the recordings of the experiments. All that they import counts, too, but for `TRAINED_RUNS`."""
+
+TRAINED_RUNS = ("enerf_ns.method", "enerf_ns.dataparsers.event_dataparser")
+"""Packages and modules by which the simulator reads trained runs, from which no experiment simulates."""
 
 RECONSTRUCTION = "enerf_ns.reconstruction.reconstruction"
 """Module that makes frames of events."""
@@ -53,21 +56,26 @@ LARGEST_HASHED = 16_000_000
 
 
 @cache
-def code_digest(*roots: str) -> str:
-    """A short name for the code of some modules and all that they import, without comments and docstrings."""
+def code_digest(*roots: str, left_out: tuple[str, ...] = ()) -> str:
+    """A short name for the code of some modules and all that they import, without comments and docstrings.
+
+    Args:
+        roots: Names of the modules.
+        left_out: Modules and packages that do not count where others import them, beside `LEFT_OUT`.
+    """
     found = hashlib.sha256()
-    for name in sorted(modules(roots)):
+    for name in sorted(modules(roots, left_out)):
         found.update(f"{name} {ast.dump(_without_docstrings(_parsed(name)))}".encode())
     return found.hexdigest()[:10]
 
 
-def modules(roots: Iterable[str]) -> set[str]:
-    """Names of these modules, and of the modules of this package that they import at any level, if not `LEFT_OUT`."""
-    found = set(roots)
+def modules(roots: Iterable[str], left_out: tuple[str, ...] = ()) -> set[str]:
+    """Names of these modules, and of the modules of this package that they import at any level, if not left out."""
+    found, left_out = set(roots), (*LEFT_OUT, *left_out)
     to_do = list(found)
     while to_do:
         imported = _imported(_parsed(to_do.pop())) - found
-        new = {name for name in imported if not any(name == out or name.startswith(f"{out}.") for out in LEFT_OUT)}
+        new = {name for name in imported if not any(name == out or name.startswith(f"{out}.") for out in left_out)}
         found |= new
         to_do += new
     return found

@@ -28,6 +28,7 @@ from enerf_ns.bench.inputs import (
     NUMERICAL_ERRORS,
     RECONSTRUCTION,
     SIMULATION,
+    TRAINED_RUNS,
     TRAINING,
     code_digest,
     recording_digest,
@@ -246,7 +247,7 @@ class Bench:
         if simulation is None:
             recording = recording_digest(self._recorded(cell))
         else:
-            recording = [simulation, sequence.files, code_digest(*SIMULATION)]
+            recording = [simulation, sequence.files, code_digest(*SIMULATION, left_out=TRAINED_RUNS)]
         code = [*TRAINING, *([ALL_READERS] * (simulation is None)), *([NUMERICAL_ERRORS] * self.experiment.parts)]
         about = {
             "method": self._method(cell),

@@ -79,10 +79,11 @@ def lines(results: Results) -> list[Line]:
     sequences = list(dict.fromkeys(run["sequence"] for run in runs))
     rows = list(dict.fromkeys(run["row"] for run in runs))
     of_reference = _reference_seconds(results)
-    missing = set(results.get("sequences", sequences)).difference(sequences)
-    of_mean = f"{MEAN} of {', '.join(sequences)}" if missing else MEAN
+    whole = results.get("sequences", sequences)
+    missing = set(whole).difference(sequences)
+    of_mean = f"{MEAN} of {', '.join(name for name in whole if name in sequences)}" if missing else MEAN
     blocks = [] if results["mean"] else [[sequence] for sequence in sequences]
-    if results["mean"] or MEAN in published:
+    if results["mean"] or (MEAN in published and not missing):
         blocks.append(sequences)
     found = []
     for number, block in enumerate(blocks):

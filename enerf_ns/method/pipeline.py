@@ -456,7 +456,7 @@ class EnerfPipeline(VanillaPipeline):
                 save_pictures(aligned_views(views)[0], output_path)
         scores = summary_scores(views, summary, get_std)
         protocol = str(scores["protocol"] if step is None else scores.pop("protocol"))
-        if step is None and self.poses.corrected:
+        if step is None and self.poses.corrections.words:
             stated = scores_at_stated_poses(self)
             scores |= {f"{name}_at_stated_poses": value for name, value in stated.items()}
         CONSOLE.print(described(protocol), soft_wrap=True, highlight=False, markup=False)

@@ -44,6 +44,7 @@ from enerf_ns.dataparsers.recording.errors import (
 )
 from enerf_ns.dataparsers.recording.files import absolute, write_together, write_whole
 from enerf_ns.dataparsers.recording.recording import EventRecording
+from enerf_ns.evaluation.history import HISTORY_FILE
 from enerf_ns.kernels.hash_grid import fitting
 from enerf_ns.kernels.threads import kernels_alone
 from enerf_ns.method.checkpoints import (
@@ -86,6 +87,9 @@ CHOICES_FILE, CHOICES_COLUMNS = "choices.txt", 100
 
 LONG = 3600.0
 """Seconds of training from which the time that it takes is printed at the start."""
+
+START_SECONDS = 60.0
+"""Seconds within which a run may have written its config and no scores yet."""
 
 
 @dataclass
@@ -186,7 +190,8 @@ class EnerfTrainerConfig(TrainerConfig):
             FlagError: The run was moved or copied to that folder.
         """
         stated, beside = absolute(self.get_base_dir()), folder / self.relative_model_dir
-        if stated != folder and beside.is_dir():
+        is_there = stated.exists() and stated.samefile(folder)
+        if beside.is_dir() and not is_there:
             raise FlagError(
                 f"--load-config continues the run in {stated}, but its checkpoints were moved or copied to {folder}; "
                 "move the run back, or train on in a new folder with the flags of the run and --load-dir "
@@ -355,7 +360,7 @@ class EnerfTrainerConfig(TrainerConfig):
                 del files[ORIGIN_FILE]
             is_alone = self.machine.num_machines == 1  # the machines of one run may share its folder
             is_new = is_alone and not is_loaded and config.load_dir != folder / config.relative_model_dir
-            if is_new and (folder / "config.yml").exists():  # of a run that started in the same second, say
+            if is_new and _holds_run(folder):
                 raise _taken(folder)
             try:
                 write_together(folder, {name: text.encode() for name, text in files.items()})
@@ -377,9 +382,17 @@ class EnerfTrainerConfig(TrainerConfig):
 
 def _taken(folder: Path) -> OutputError:
     return OutputError(
-        f"{folder} holds a run already; continue it with --load-config {quoted(folder / 'config.yml')}, or give the "
-        "new one another --timestamp."
+        f"{folder} holds a run already; continue it with --load-config {quoted(folder / 'config.yml')}, give the new "
+        "one another --timestamp, or remove the folder."
     )
+
+
+def _holds_run(folder: Path) -> bool:
+    """Whether a folder has scores of a run, or a run that may have been started in the same second."""
+    if not (folder / "config.yml").exists():
+        return False
+    age = time.time() - (folder / "config.yml").stat().st_mtime
+    return (folder / HISTORY_FILE).exists() or age < START_SECONDS
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:

@@ -154,10 +154,15 @@ class Corrections:
         return times + round(MILLISECOND * self.delay) + grown.round().astype(np.int64)
 
     def _knots(self, given: Trajectory, own: Trajectory, start: int, end: int) -> Int64[np.ndarray, " poses"]:
-        """Times (ns) of a camera's own poses on the clock of the events, from a start to an end, and these two."""
+        """Times (ns) of a camera's own poses on the clock of the events, from a start to an end, and these two.
+
+        Where its poses do not reach, times are as far apart as they are elsewhere, since splines swing in long gaps.
+        """
         middle = _middle(given)
         since = (own.times - middle - round(MILLISECOND * self.delay)) / (1.0 + 1e-3 * self.delay_rate)
         times = np.unique(middle + since.round().astype(np.int64))
+        step = int(np.median(np.diff(own.times)))
+        times = np.concatenate([np.arange(times[0], start, -step)[:0:-1], times, np.arange(times[-1], end, step)[1:]])
         return np.concatenate([[start], times[(times > start) & (times < end)], [end]])
 
     def poses(self, given: Trajectory, times: Int64[np.ndarray, " times"]) -> Float64[np.ndarray, "times 3 4"]:

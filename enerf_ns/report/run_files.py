@@ -88,6 +88,18 @@ def find_runs(path: Path) -> list[Path]:
     return sorted(file.parent for file in path.rglob("config.yml")) or [path]
 
 
+def _newest_state(folder: Path) -> tuple[int, float]:
+    """Number and time (s) of the steps in the newest whole checkpoint of a folder; 0 if there is none."""
+    checkpoint = newest_checkpoint(folder)
+    if checkpoint is None:
+        return 0, 0.0
+    try:
+        state = load_checkpoint(checkpoint)
+    except FileNotFoundError:  # training has stored another one, and removed this one
+        return _newest_state(folder)
+    return int(checkpoint.stem.removeprefix("step-")) + 1, float(state["error_against_time"]["seconds"])
+
+
 def read_run(path: Path) -> RunFiles:
     """Reads the files of a run.
 
@@ -114,10 +126,7 @@ def read_run(path: Path) -> RunFiles:
     with reading(folder / HISTORY_FILE, "the history of a run"):
         history = read_history(folder)
     try:
-        checkpoint = newest_checkpoint(folder / "nerfstudio_models")
-        if checkpoint is not None:
-            stored = int(checkpoint.stem.removeprefix("step-")) + 1
-            stored_seconds = float(load_checkpoint(checkpoint)["error_against_time"]["seconds"])
+        stored, stored_seconds = _newest_state(folder / "nerfstudio_models")
     except RecordingError as error:
         notes.append(str(error))
     about: dict[str, Any] = {CHOICES_FILE: [], ORIGIN_FILE: {}}

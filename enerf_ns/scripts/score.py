@@ -47,6 +47,8 @@ class Score:
     """One frame in so many is held out. Default: 4."""
     held_out_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
     """Numbers of the held-out frames, from 0. Default: those that held-out-every selects."""
+    train_frame_indices: Optional[Tuple[int, ...]] = None  # noqa: UP006, UP045
+    """Numbers of the frames that were trained on, if they were stated. By default they are not held out."""
     time_range: Optional[Tuple[float, float]] = None  # noqa: UP006, UP045
     """First and last second to use, on the recording's clock. Default: the whole recording."""
     downscale_factor: Optional[float] = None  # noqa: UP045
@@ -84,7 +86,8 @@ class Score:
 
     def _selection(self) -> str:
         """The flags that select the held-out frames, as they were given."""
-        names = ("preset", "held_out_every", "held_out_frame_indices", "time_range", "downscale_factor")
+        of_frames = ("preset", "held_out_every", "held_out_frame_indices", "train_frame_indices")
+        names = (*of_frames, "time_range", "downscale_factor")
         given = {name: getattr(self, name) for name in names} | self.options.given()
         words = []
         for name, value in given.items():
@@ -112,6 +115,7 @@ class Score:
             data=recording.path,
             held_out_every=self.held_out_every,
             held_out_frame_indices=self.held_out_frame_indices,
+            train_frame_indices=self.train_frame_indices,
             downscale_factor=self.downscale_factor,
         )
         if self.preset is not None:

@@ -227,7 +227,8 @@ def test_a_mean_over_a_part_of_the_sequences_is_named_by_them_and_compared_with_
     assert rows_of(markdown(both))[0][-1] == "30.00"
     assert [line[:3] for line in rows_of(markdown(part))] == [["mean of b", "events", "21.00"]]
     assert "30.00" not in markdown(part)
-    for old in (both, {name: value for name, value in both.items() if name != "sequences"}):
+    backwards = {**both, "runs": both["runs"][::-1]}
+    for old in (both, backwards, {name: value for name, value in both.items() if name != "sequences"}):
         assert [(change.row, change.before, change.now) for change in changes_since(part, old)] == [
             ("events", 21.0, 21.0)
         ]

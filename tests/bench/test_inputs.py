@@ -16,6 +16,7 @@ from enerf_ns.bench.inputs import (
     LEFT_OUT,
     NUMERICAL_ERRORS,
     SIMULATION,
+    TRAINED_RUNS,
     TRAINING,
     modules,
     recording_digest,
@@ -71,7 +72,9 @@ def test_the_layouts_of_all_simulated_recordings_count(tmp_path: Path):
     simulated = [sequence for sequence in SEQUENCES.values() if sequence.scene is not None]
     layouts = {resolve(sequence.simulation_settings(tmp_path)).layout for sequence in simulated}
     assert len(layouts) > 1
-    assert {f"enerf_ns.dataparsers.formats.{layout}" for layout in layouts} <= modules(SIMULATION)
+    found = modules(SIMULATION, TRAINED_RUNS)
+    assert {f"enerf_ns.dataparsers.formats.{layout}" for layout in layouts} <= found
+    assert "enerf_ns.simulator.event_sensor" in found and "enerf_ns.supervision.losses" not in found
 
 
 @pytest.mark.parametrize(

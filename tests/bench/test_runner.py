@@ -86,7 +86,7 @@ def test_a_result_file_alone_is_enough_to_go_on(finished: Path, tmp_path: Path):
 
 def test_a_result_of_other_code_is_made_again(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = shutil.copytree(finished, tmp_path / "copy")
-    monkeypatch.setattr(runner, "code_digest", lambda *_: "other code")
+    monkeypatch.setattr(runner, "code_digest", lambda *_, **__: "other code")
     assert len(finish(folder)) == len(table(folder))
     assert len(list((folder / "recordings").iterdir())) == 2, "the simulator is other code, too"
 

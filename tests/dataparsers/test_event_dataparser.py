@@ -359,6 +359,10 @@ def test_stated_numbers_choose_among_frames_beside_held_out_views(tmp_path: Path
     for stated, expected in (((0, 2), [0, 2]), (None, [1])):
         frames, _ = split_frames(recording, EventDataParserConfig(held_out_frame_indices=stated), held_out=True)
         assert frames.numbers.tolist() == expected
+    frames, are_frames = split_frames(
+        replace(recording, frames=None), EventDataParserConfig(held_out_frame_indices=(0, 2)), held_out=True
+    )
+    assert frames.numbers.tolist() == [1] and are_frames, "there are no other frames to choose among"
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,19 @@ def test_frames_keep_their_exposures_when_they_are_corrected_to_beyond_the_poses
     assert len(kept.times) == len(times) - 1
 
 
+def test_a_camera_moves_on_evenly_beyond_poses_with_noise():
+    """A spline through the last poses and one that is far away would swing."""
+    times, random = np.arange(0, 1001, 5) * MILLISECOND, np.random.default_rng(0)
+    positions = 1e-9 * times[:, None] * [1.0, 0.0, 0.0] + 2e-4 * random.normal(size=(len(times), 3))
+    noisy = Trajectory(times, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1)))
+    instants = np.arange(10, 991, 35) * MILLISECOND
+    frames = Frames(tuple(map(Path, instants.astype(str))), instants, CAMERA, noisy)
+    given = EventRecording(Path("made"), "made", CAMERA, noisy, lambda: iter(()), (), frames=frames)
+    found = Corrections(frame_delay=-100.0).frames(frames, given)
+    poses = found.trajectory.poses(torch.from_numpy(found.times)).numpy()
+    np.testing.assert_allclose(poses[:, :, 3], poses_at(noisy, found.times)[:, :, 3], atol=5e-4)
+
+
 def test_nothing_wrong_is_the_recording_itself(tmp_path: Path):
     given = made(tmp_path)
     nothing = Corrections()

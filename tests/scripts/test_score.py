@@ -145,6 +145,8 @@ def test_the_held_out_frames_are_those_of_training(recording: Path, tmp_path: Pa
     assert [frame["file_path"] for frame in json.loads(views.read_text())["frames"]] == ["00002.png"]
     Score(recording, views=views, held_out_frame_indices=(0, 1)).main()
     assert len(json.loads(views.read_text())["frames"]) == 2
+    Score(recording, views=views, train_frame_indices=(2,)).main()
+    assert [frame["file_path"] for frame in json.loads(views.read_text())["frames"]] == ["00000.png", "00001.png"]
 
 
 GREY = image(0)

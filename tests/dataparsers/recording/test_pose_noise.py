@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,13 @@ def test_a_camera_of_the_frames_stays_where_it_is_mounted():
     np.testing.assert_allclose(found.positions, expected.positions, atol=1e-12)
     off = Rotation.from_quat(found.quaternions).inv() * Rotation.from_quat(expected.quaternions)
     assert off.magnitude().max() < 1e-9
+
+    other, _, _ = moving(1e-3, 0.1, seed=1)  # tracked by itself, at the same times
+    frames = replace(frames, trajectory=other)
+    smooth = replace(recording, frames=frames).selected(None, False, smooth_poses=True)
+    alone = pose_noise(other)
+    assert smooth.frames is not None and alone is not None
+    np.testing.assert_array_equal(smooth.frames.trajectory.positions, alone.smooth.positions)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
