@@ -285,7 +285,7 @@ class ErrorAgainstTime:
             return
         pairs, recording, poses = self.pipeline.num_scored_pairs, manager.recording, self.pipeline.poses
         cause, left = config.resolution.cause, None
-        if cause and final and poses.corrections.words:
+        if cause and final and poses.corrected:
             left = why_poses_do_not_fit(recording, manager.depth_range, recording)
             cause = left or why_depths_do_not_fit(recording, manager.depth_range) or ""
         self.verdict = verdict_on_events(scores, pairs, done, cause, recording.path, left is not None)
