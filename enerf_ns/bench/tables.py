@@ -157,19 +157,16 @@ def changes_since(results: Results, before: Results) -> list[Change]:
     """The change of each row on the sequences that both results have, largest loss first."""
     sequences = {run["sequence"] for run in results["runs"]} & {run["sequence"] for run in before["runs"]}
     whole = results.get("sequences", [*sequences])
-    then, now = (_psnr_of_rows({**_of_sequences(one, sequences), "sequences": whole}) for one in (before, results))
+    then, now = (_psnr_of_rows(one, sequences, whole) for one in (before, results))
     found = [Change(*key, mean(then[key]), mean(now[key])) for key in now if key in then]
     return sorted(found, key=lambda change: change.now - change.before)
 
 
-def _psnr_of_rows(results: Results) -> dict[tuple[str, str], list[float]]:
-    """PSNR of each sequence and row, one for each seed."""
-    return {(line.sequence, line.row): line.scores["psnr"] for line in lines(results) if line.scores.get("psnr")}
-
-
-def _of_sequences(results: Results, sequences: set[str]) -> Results:
-    """The results on some of the sequences."""
-    return {**results, "runs": [run for run in results["runs"] if run["sequence"] in sequences]}
+def _psnr_of_rows(results: Results, sequences: set[str], whole: list[str]) -> dict[tuple[str, str], list[float]]:
+    """PSNR of each row on some sequences of the whole experiment, one for each seed."""
+    runs = [run for run in results["runs"] if run["sequence"] in sequences]
+    table = lines({**results, "runs": runs, "sequences": whole})
+    return {(line.sequence, line.row): line.scores["psnr"] for line in table if line.scores.get("psnr")}
 
 
 def changes_table(changes: list[Change], file: str) -> Table:
